@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,23 +45,34 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session")
-def solved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The run folder of case study 1 in a formulation; it is not to be changed.
-
-    Solved once for all processes of pytest-xdist, whose own folders lie beside each other.
-    """
+def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
+    """A folder by name for all processes of pytest-xdist, in a `with` that one enters at a time."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    @contextmanager
+    def folder(name: str) -> Iterator[Path]:
+        place = base / f"shared_{name}"
+        place.mkdir(exist_ok=True)
+        with (base / f"{name}.lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            yield place
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def solved(common_folder: Callable[[str], Any]) -> Callable[[str], Path]:
+    """The run folder of case study 1 in a formulation; it is not to be changed."""
 
     def solve(formulation: str) -> Path:
         from oracles.commands import run
 
-        folder, making = base / f"two_mass_{formulation}", base / f"making_{formulation}"
-        with (base / f"{formulation}.lock").open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+        with common_folder(f"two_mass_{formulation}") as place:
+            folder: Path = place / "run"
             if not folder.exists():
-                assert run(making, "--formulation", formulation) == 0
-                making.rename(folder)
+                assert run(place / "making", "--formulation", formulation) == 0
+                (place / "making").rename(folder)
         return folder
 
     return solve

@@ -99,9 +99,7 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             # a fixed structure bounds it on every plant of its set
             compliance_max=None if structured else inner.compliance_max,
         ),
-        suspension=Suspension(
-            case.suspension.frequency_hz, case.suspension.damping_ratio, case.suspension.rigid_modes
-        ),
+        suspension=_suspension(case),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
         controller=structured_problem(case, tuple(map(_options, case.robust.plants)))
@@ -134,6 +132,16 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         words = f"{function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _suspension(case: Case) -> Suspension:
+    """A default suspension lies a decade below the lowest frequency that a bound names: nearer to
+    the bandwidth, what is synthesised on it is unstable or slow on the free bodies."""
+    table, softest = case.suspension, Suspension()
+    frequency = table.frequency_hz
+    if frequency is None:
+        frequency = min(softest.frequency_hz, 0.1 * case.inner.omega_low_hz)
+    return Suspension(frequency, table.damping_ratio, table.rigid_modes)
 
 
 def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:

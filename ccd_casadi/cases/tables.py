@@ -186,8 +186,10 @@ class InnerTable:
 class SuspensionTable:
     """[suspension]: where a mixed synthesis puts rigid-body poles, and how many there must be."""
 
-    frequency_hz: float = key(
-        "frequency of the soft suspension that free bodies have in a mixed synthesis", 0.1
+    frequency_hz: float | None = key(
+        "frequency of the soft suspension that free bodies have in a mixed synthesis; absent: a "
+        "tenth of omega_low_hz, at most 0.1 Hz",
+        None,
     )
     damping_ratio: float = key("of these poles", 0.7)
     rigid_modes: int | None = key("required number of rigid-body modes; absent: any number", None)

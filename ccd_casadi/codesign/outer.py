@@ -1,7 +1,12 @@
-"""What the outer problem asks of one kind of inner problem; its search is written against this.
+"""The interface of the outer problem min J(x), x = (θ, what else a kind adds), to its search.
 
-A kind knows how its formulations run, how a design is polished on the truth and what the whole
-inner problem at θ has to say against it, and how the design that is left is judged.
+`outer_search` calls it in this order: `prepared`, `solve_formulation` (surrogates, or local solves
+on the truth), `polished` (a local solve, then a wider search for a better controller at its θ),
+`extended` where plants exceed a bound at the design, `verified`. Each kind of inner problem
+implements it.
+
+*The truth* is the inner problem itself, in contrast to its surrogate. Lengths in x are shares of
+the box of its bounds.
 """
 
 from abc import ABC, abstractmethod
@@ -32,7 +37,7 @@ from surrogates import design
 
 @dataclass(frozen=True)
 class Place:
-    """Where a local solve on the truth ended: x, J, and whether it is a stationary point."""
+    """The end of a local solve on the truth: x (n,), J, and whether x is a stationary point."""
 
     x: Array
     objective: float
@@ -41,11 +46,20 @@ class Place:
 
 @dataclass(frozen=True)
 class PolishedDesign:
-    """A polished design of the truth before it is judged.
+    """A local optimum of the truth, before it is judged.
 
-    `x` begins with θ. `gap`: by how much (relative) the whole inner problem at θ is better, NaN
-    where its search found nothing or was not made;
-    `objective` infinite where the design is not certified or breaks a bound.
+    Attributes
+    ----------
+    x : array (n,)
+        θ first.
+    value : float
+        Optimal value of the inner problem at θ, SI: ω_b in rad/s, or what the case minimises.
+    objective : float
+        J; inf where the design is not certified or exceeds a bound.
+    kkt : KktCertificate
+    gap : float
+        Relative improvement by a multi-start search for the controller at θ; NaN where it found
+        nothing or was not made.
     """
 
     x: Array
@@ -56,28 +70,31 @@ class PolishedDesign:
 
     @property
     def feasible(self) -> bool:
-        """Whether its constraints are met."""
+        """Whether it is certified and meets its constraints."""
         return bool(np.isfinite(self.objective))
 
 
 def is_expensive(problem: CoDesignProblem) -> bool:
-    """Whether the elements of another θ take as long as a search there."""
+    """Whether the plant at another θ takes as long as a search for its controller: finite elements.
+
+    Such a plant has cheap models `nearby` θ that are solved already.
+    """
     return plant_of(problem).nearby is not None
 
 
 class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
-    kkt_level: float  # residual up to which an end counts as stationary
-    same_optimum = 1e-2  # of the box: ends of local solves on the truth that are closer are one
-    extra_variables: tuple[str, ...] = ()  # what else x holds, logarithms
+    kkt_level: float  # scaled KKT residual up to which x counts as stationary
+    same_optimum = 1e-2  # of the box: ends of local solves that are closer are one optimum
+    extra_variables: tuple[str, ...] = ()  # components of x after θ, by their logarithms
 
     def __init__(self, sampler: Sampler) -> None:
         self.sampler = sampler
 
     @property
     def problem(self) -> CoDesignProblem:
-        """The problem, with what a search has added to it."""
+        """The problem, with the plants and warm starts that searches have added to it."""
         return self.sampler.problem
 
     def theta_of(self, x: Array) -> Array:
@@ -86,16 +103,16 @@ class Outer(ABC):
 
     @property
     def global_check_is_cheap(self) -> bool:
-        """Whether local solves may start from points that are no better."""
+        """Whether the global check also starts local solves where J is not lower than at its x."""
         return not is_expensive(self.problem)
 
-    def promising(self, thetas: Array, least: float) -> Array:
-        """Those of θ (k, n_θ) where it is not shown beforehand that J is `least` or more."""
+    def promising(self, thetas: Array, threshold: float) -> Array:
+        """Those of θ (k, n_θ) at which no cheap bound proves J >= threshold; by default all."""
         return thetas
 
     @property
     def retries_pay(self) -> bool:
-        """Whether searches from beside an end that is not stationary pay."""
+        """Whether an x that is not stationary is searched again from perturbed starts."""
         return True
 
     @property
@@ -104,19 +121,20 @@ class Outer(ABC):
         return box(self.problem)
 
     def prepared(self, seed: int) -> "Outer":
-        """With what every search needs before it begins."""
+        """This, ready for a search: for instance with warm starts for the controller."""
         return self
 
     def resumed(self, folder: Path, seed: int) -> "Outer":
-        """With what the run in a folder ended with, where its kind needs that."""
+        """This, with the warm starts and plants of the run in a folder, where a kind has them."""
         return self
 
     def solve_formulation(
         self, formulation: Formulation, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        """One formulation, from the samples that are given where there are any.
+        """Solve one formulation, from the samples `given` by a run that is retrained, if any.
 
-        Lifted over θ alone is nested: what is lifted are the exact gradients.
+        Where x is θ alone there is nothing to lift but the gradients: lifted is then nested on
+        samples with exact gradients.
         """
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
@@ -130,71 +148,77 @@ class Outer(ABC):
         return solve_nested(self.sampler, formulation, seed=seed, given=given, gradients=lifted)
 
     def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
-        """The direct formulation: local solves from the case's start and a Sobol set beside it.
+        """The direct formulation: local solves from the case's start and from Sobol points.
 
-        From one start that has a design it is the polish that follows.
+        A single start with a design is returned as it is: the polish that follows is the local
+        solve from it.
         """
-        spread = design("sobol", *box(self.problem), starts, seed)
-        thetas = np.vstack([self.problem.start, spread])[:starts]
-        begun = self.sampler.values(thetas, "direct")
-        if starts == 1 and begun[0].feasible:
-            return FormulationResult(begun[0].joint, agreed=True)
-        places: list[Place] = []
-        for sample in begun:
-            place = self.local_solve(sample, places)
-            places += [] if place is None else [place]
-        if not places:
+        sobol = design("sobol", *box(self.problem), starts, seed)
+        thetas = np.vstack([self.problem.start, sobol])[:starts]
+        samples = self.sampler.values(thetas, "direct")
+        if starts == 1 and samples[0].feasible:
+            return FormulationResult(samples[0].joint, agreed=True)
+        ends: list[Place] = []
+        for sample in samples:
+            end = self.local_solve(sample, ends)
+            ends += [] if end is None else [end]
+        if not ends:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
             return FormulationResult(message=words)
-        ends = distinct(
-            [(one.objective, one.x) for one in places], self.bounds, starts, self.same_optimum
+        optima = distinct(
+            [(end.objective, end.x) for end in ends], self.bounds, starts, self.same_optimum
         )
-        return FormulationResult(ends.best.x, outer=ends, agreed=True)
+        return FormulationResult(optima.best.x, outer=optima, agreed=True)
 
     @abstractmethod
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """A formulation that found nothing: a design to go on from, or why there is none."""
+        """Replace an outcome without x: by a design to continue from, or a message why not."""
 
     @abstractmethod
     def polished(self, x: Array) -> PolishedDesign:
-        """Polish a point on the truth, and hold the whole inner problem there against it."""
+        """Local solve on the truth from x, then compare with a wider search of the inner problem
+        at its θ (`gap`)."""
 
     def extended(self, end: PolishedDesign) -> "Outer | None":
-        """With what stood against an end, to be searched again; None where nothing did."""
+        """This, with the plants on which an end exceeds a bound, to search again; None where there
+        are none."""
         return None
 
     def with_training_sample(
         self, outcome: FormulationResult, end: PolishedDesign
     ) -> FormulationResult:
-        """With surrogates that have an end among their samples, which they did not foresee."""
-        values, slopes = self.training_samples(end, outcome.surrogates[0].lower.size)
-        found = [
-            with_sample(process, end.x[: process.lower.size], value, slope)
-            for process, value, slope in zip(outcome.surrogates, values, slopes, strict=True)
+        """The outcome with the true sample at an end added to its surrogates, for an end that they
+        did not predict."""
+        values, gradients = self.training_samples(end, outcome.surrogates[0].lower.size)
+        surrogates = [
+            with_sample(process, end.x[: process.lower.size], value, gradient)
+            for process, value, gradient in zip(outcome.surrogates, values, gradients, strict=True)
         ]
-        return replace(outcome, surrogates=tuple(found))
+        return replace(outcome, surrogates=tuple(surrogates))
 
     def training_samples(self, end: PolishedDesign, inputs: int) -> tuple[Array, Array]:
-        """Values (k,) and slopes (k, n) at an end of what surrogates of n = `inputs` fit."""
-        found = self.sampler.values(self.theta_of(end.x), "the end")[0]
-        return np.array([end.value]), np.array([found.gradient])
+        """Values (k,) and gradients (k, n) at an end of what k surrogates fit; n = `inputs`."""
+        sample = self.sampler.values(self.theta_of(end.x), "the end")[0]
+        return np.array([end.value]), np.array([sample.gradient])
 
     @abstractmethod
     def local_solve(
-        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+        self, sample: InnerSample, earlier: Sequence[Place], settled: float | None = None
     ) -> Place | None:
-        """A local solve on the truth from a sample; none goes on near `known` stationary points.
+        """Local solve on the truth from a sample; None where it finds no feasible design.
 
-        `settled`: relative change of J at which it ends.
+        It stops where it comes near a stationary point of `earlier` ends: the basin is known.
+        `settled`: relative change of J per step at which it stops, the kind's own by default.
         """
 
     def failure_reason(self, solution: Solution, share: float | None) -> str:
-        """Why a solution is not verified; `share` of a robust set that was held on the way."""
+        """Why a solution is not verified. `share`: part of the tolerance of a robust set of plants
+        up to which the homotopy found designs."""
         return str(solution.result["reason"])
 
     @abstractmethod
     def verified(self, end: PolishedDesign, rounds: int) -> Verified:
-        """The design judged on the truth, after so many `rounds` of the whole search."""
+        """Judge the design on the truth, after this number of `rounds` of the whole search."""
 
     def point_of(self, run: FinishedRun) -> Array:
         """x of a run's design."""
@@ -202,4 +226,4 @@ class Outer(ABC):
 
     @abstractmethod
     def responses(self, x: Array) -> PostOptimal:
-        """How an optimum at x answers to what was given."""
+        """Derivatives of an optimum at x to the data of the problem (post-optimal sensitivity)."""

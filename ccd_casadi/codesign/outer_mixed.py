@@ -99,12 +99,12 @@ class MixedOuter(Outer):
         return found.values[:-1], found.gradients[:-1]
 
     def local_solve(
-        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+        self, sample: InnerSample, earlier: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         truth = self.sampler.truth
         # where no design is feasible it goes from the middle of the weights' frequencies
         begin = np.where(np.isfinite(sample.joint), sample.joint, np.mean(self.bounds, axis=0))
-        basins = [(place.x, place.objective) for place in known if place.stationary]
+        basins = [(place.x, place.objective) for place in earlier if place.stationary]
         settled = PeakDescentOptions().settled if settled is None else settled
         end = descend(truth, begin, ended=basins, settled=settled)
         for x in (end, begin):

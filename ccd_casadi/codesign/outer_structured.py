@@ -97,9 +97,9 @@ class StructuredOuter(ThetaOuter):
     def retries_pay(self) -> bool:
         return not is_expensive(self.problem)
 
-    def promising(self, thetas: Array, least: float) -> Array:
+    def promising(self, thetas: Array, threshold: float) -> Array:
         """By what no controller of any order reaches: far sooner than a search finds none."""
-        tasks = {i: (self.problem, theta, least) for i, theta in enumerate(thetas.tolist())}
+        tasks = {i: (self.problem, theta, threshold) for i, theta in enumerate(thetas.tolist())}
         excluded = dict(results(self.sampler.workers, _excluded, tasks))
         return thetas[[not excluded[i] for i in tasks]]
 
@@ -128,13 +128,13 @@ class StructuredOuter(ThetaOuter):
         return outer
 
     def local_solve(
-        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+        self, sample: InnerSample, earlier: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         """By the joint search where J counts the bandwidth, on the worse plants of its way."""
         if self.problem.figure is not BANDWIDTH or settled is not None:
-            return super().local_solve(sample, known, settled)
+            return super().local_solve(sample, earlier, settled)
         tell = printer("local solve", self.sampler.quiet)
-        ends = [(place.x, place.objective) for place in known]
+        ends = [(place.x, place.objective) for place in earlier]
         sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), tell, ends)
         J = objective_of(sampler.problem, best)
         if not np.isfinite(J):

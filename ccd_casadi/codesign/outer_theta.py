@@ -63,12 +63,12 @@ class ThetaOuter(Outer, ABC):
         )
 
     def local_solve(
-        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+        self, sample: InnerSample, earlier: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem = self.problem
         far = self.options.far_radius, self.options.settled
         first, least = far if settled is None else (PiecesOptions.radius, settled)
-        best = pieces_from(self.sampler, sample, least, first, known)
+        best = pieces_from(self.sampler, sample, least, first, earlier)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None

@@ -1,6 +1,7 @@
-"""What a page shows, as plain data: words, tables, and figures down to every point of a curve.
+"""What a page shows, as plain data: texts, tables, and figures with every point of their curves.
 
-Made where the figures are known, kept in `report.json` (`stored`) and painted by `paint`.
+`reporting` makes it; `paint` stores it in `report.json`, reads it back and draws it as
+HTML and SVG. Names of classes and fields are keys of that file.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,12 +16,12 @@ from ccd_casadi.support.json_files import json_values
 
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
-LEAST_POINTS = 8  # of a curve that values are read off
+LEAST_POINTS = 8  # a curve with fewer is a drawn shape, off which no values are read
 
 
 @dataclass(frozen=True)
 class Curve:
-    """y over x.
+    """A polyline or points (x_k, y_k).
 
     Attributes
     ----------
@@ -28,11 +29,11 @@ class Curve:
         In the units of the panel's labels.
     label, colour : str
     line, marker : str
-        As in matplotlib, either may be empty.
+        Styles of matplotlib, either may be empty.
     width : float
-        pt.
+        Of the line, pt.
     hz : array (k,), optional
-        Frequencies in Hz of the points, where the curve is a locus and not y of x.
+        Frequency of each point in Hz: the curve is a locus with ω as its parameter (Nyquist).
     """
 
     x: Array
@@ -46,9 +47,10 @@ class Curve:
 
     @property
     def readable(self) -> bool:
-        """Whether values are read off it: a line of several points, from left to right."""
-        rising = len(self.x) >= LEAST_POINTS and bool((np.diff(self.x) >= 0.0).all())
-        return bool(self.line) and rising
+        """Whether it is a function y(x), of which the page shows values under the cursor and in a
+        table: a line of enough points with x not decreasing."""
+        function = len(self.x) >= LEAST_POINTS and bool((np.diff(self.x) >= 0.0).all())
+        return bool(self.line) and function
 
 
 @dataclass(frozen=True)
@@ -70,14 +72,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Mark:
-    """A marked point and its words.
+    """A point with a marker and a text.
 
     Attributes
     ----------
     x, y : float
     text, marker, colour : str
+        Text and marker (a style of matplotlib) may be empty.
     offset : tuple of float
-        Of the words, pt.
+        From the point to the text, pt to the right and up.
     """
 
     x: float
@@ -90,11 +93,12 @@ class Mark:
 
 @dataclass(frozen=True)
 class Level:
-    """A thin line across the panel, with its words at the end.
+    """A dashed line across the panel, with a text at its end.
 
     Attributes
     ----------
     value : float
+        y of a horizontal line, x of a vertical one.
     text : str
     vertical : bool
     colour : str
@@ -108,12 +112,12 @@ class Level:
 
 @dataclass(frozen=True)
 class Area:
-    """A shaded area, where a curve may not be.
+    """A shaded polygon, which no curve may enter.
 
     Attributes
     ----------
     x, y : arrays (k,)
-        Its corners.
+        Its vertices.
     colour : str
     """
 
@@ -130,17 +134,18 @@ class Panel:
     ----------
     x_label, y_label : str
         With units.
-    curves, bands, marks, levels, forbidden : tuples
-        Of Curve, Band, Mark, Level, Area.
+    curves, bands, marks, levels : tuples of Curve, Band, Mark, Level
+    forbidden : tuple of Area
     log_x, log_y : bool
     x_range, y_range : tuple of float, optional
         By default those of the data.
     y_step : float, optional
-        Between ticks.
+        Between ticks of y.
     legend : "best" or None
+        "best": in the corner that covers least. None: no legend.
     title : str
     equal : bool
-        Both axes have one scale.
+        A unit is of the same length on both axes.
     """
 
     x_label: str
@@ -162,9 +167,9 @@ class Panel:
 
 @dataclass(frozen=True)
 class Table:
-    """Column heads and rows of texts or numbers; numbers are rounded and set to the right.
+    """Column heads and rows of texts and numbers; a page rounds numbers and aligns them right.
 
-    A number that is not finite is None, and shows as a dash.
+    A number that is not finite is stored as None (JSON has no NaN) and shown as a dash.
 
     Attributes
     ----------
@@ -181,19 +186,19 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """Which columns hold no text."""
+        """For each column whether no entry is a text."""
         columns = range(len(self.head))
         return [all(not isinstance(row[i], str) for row in self.rows) for i in columns]
 
     @staticmethod
     def of(head: Sequence[str], *columns: Iterable[Any]) -> "Table":
-        """From columns of equal length."""
+        """Make a table from its columns, of equal length."""
         return Table(tuple(head), tuple(zip(*columns, strict=True)))
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An <svg> element that a plant or a machine has drawn.
+    """An <svg> element that a plant's own function has drawn.
 
     Attributes
     ----------
@@ -202,8 +207,8 @@ class Picture:
     Raises
     ------
     ValueError
-        It holds more than shapes and words: it goes into a page unchanged, and a report.json may
-        come from a stranger.
+        It has elements other than shapes and text. The page includes it unchanged, and a
+        report.json may come from somebody else, so scripts and links are refused.
     """
 
     svg: str
@@ -220,27 +225,28 @@ class Modes:
     ----------
     shapes : ModeShapes
     turning : bool
-        To be turned, with a scale; else small and fixed.
+        Whether the page lets the reader turn the picture and shows a scale; else it is small and
+        fixed.
     """
 
     shapes: ModeShapes
     turning: bool = False
 
 
-Place = Panel | Picture | Modes | Table | None  # None: an empty one
+Place = Panel | Picture | Modes | Table | None  # a cell of a figure's grid; None leaves it empty
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Rows of panels.
+    """A figure of panels in rows.
 
     Attributes
     ----------
     rows : tuple of tuples of Place
     title : str
-        Read out in place of the figure.
+        What a screen reader reads instead of the figure.
     heights : tuple of float
-        Of the rows in inches, 2.9 by default.
+        Of the rows, inches; 2.9 where there is none.
     """
 
     rows: tuple[tuple[Place, ...], ...]
@@ -250,7 +256,8 @@ class Lines:
 
 @dataclass(frozen=True)
 class ThetaPath:
-    """A method's way over θ, rows (θ₁, θ₂), in a colour of its own or the next one."""
+    """The iterates of a method over two parameters, `theta` (k, 2), SI; the next colour of the
+    cycle where `colour` is empty."""
 
     label: str
     theta: Array
@@ -259,28 +266,28 @@ class ThetaPath:
 
 @dataclass(frozen=True)
 class Landscape:
-    """ω_b*(θ) on a grid of two parameters, and what is known of it.
+    """The surrogate of ω_b*(θ) on a grid (n₁, n₂) of two parameters, with true samples on it.
 
     Attributes
     ----------
     names, units : tuples of str
-        Of the parameters.
-    first, second : arrays
-        Their grids, SI.
-    bandwidth_hz : array (len(first), len(second))
-        NaN: infeasible; empty where there is no surrogate.
+        Of the two parameters.
+    first, second : arrays (n₁,), (n₂,)
+        Grids of θ₁ and θ₂, SI.
+    bandwidth_hz : array (n₁, n₂)
+        Predicted ω_b*/2π, Hz. NaN: infeasible; empty where there is no surrogate.
     truths : array (k, 3)
-        Rows (θ₁, θ₂, Hz).
-    designs : array (k, 2)
-        Rows (θ₁, θ₂).
+        Rows (θ₁, θ₂, ω_b*/2π in Hz) of solved inner problems.
+    designs : array (d, 2)
+        Rows (θ₁, θ₂) of single designs at a θ whose ω_b* is not known.
     truth_label : str
-    forbidden : bool array, optional
-        Where some λ(θ) > 0.
+    forbidden : bool array (n₁, n₂), optional
+        Where a constraint is violated, λ(θ) > 0.
     region : tuple of float, optional
         Trust region (low₁, high₁, low₂, high₂).
     paths : tuple of ThetaPath
     optimum : tuple of float, optional
-        The verified θ.
+        (θ₁, θ₂) of the verified design.
     """
 
     names: tuple[str, str]
@@ -298,13 +305,13 @@ class Landscape:
 
     @property
     def outside(self) -> np.ndarray:
-        """The grid's points outside the trust region: no surrogate speaks of them."""
+        """(n₁, n₂) bool: points outside the trust region, where the surrogate was not fitted."""
         if self.region is None or not self.bandwidth_hz.size:
             return np.zeros(self.bandwidth_hz.shape, dtype=bool)
-        a, b, c, d = self.region
-        first = (self.first >= a) & (self.first <= b)
-        second = (self.second >= c) & (self.second <= d)
-        return ~(first[:, None] & second[None, :])
+        low_1, high_1, low_2, high_2 = self.region
+        inside_1 = (self.first >= low_1) & (self.first <= high_1)
+        inside_2 = (self.second >= low_2) & (self.second <= high_2)
+        return ~(inside_1[:, None] & inside_2[None, :])
 
 
 Drawing = Lines | Landscape | Modes | Picture
@@ -319,7 +326,7 @@ class Figure:
     drawing : Lines, Landscape, Modes or Picture
     caption : str
     tables : tuple of Table
-        The numbers behind it, which a page folds away; by default those of its curves.
+        Its numbers, in a part of the page that is closed at first; by default those of its curves.
     """
 
     drawing: Drawing
@@ -360,11 +367,11 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Links:
-    """Pages beside this one.
+    """Links to pages in the same folder.
 
     Attributes
     ----------
-    items : tuple of (address, title, words)
+    items : tuple of (address, title, description)
     """
 
     items: tuple[tuple[str, str, str], ...]
@@ -372,14 +379,14 @@ class Links:
 
 @dataclass(frozen=True)
 class Source:
-    """Text as it is, in a box."""
+    """Preformatted text, such as code, in a box."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Quantity, value and remark in three columns.
+    """A list in three columns: quantity, value and remark.
 
     Attributes
     ----------
@@ -391,7 +398,16 @@ class Facts:
 
 @dataclass(frozen=True)
 class Steps:
-    """One of several pictures at a time, with its words, chosen by a slider; `first` is shown."""
+    """Figures of which a slider shows one at a time.
+
+    Attributes
+    ----------
+    steps : tuple of (text, Lines)
+    first : int
+        Index of the one that is shown at first.
+    label : str
+        Of the slider.
+    """
 
     steps: tuple[tuple[str, Lines], ...]
     first: int
@@ -405,9 +421,11 @@ class VerdictRow:
     Attributes
     ----------
     name : str
+        What was checked, as in docs/verdict.md: certified, optimal, ...
     state : str
         `passed`, `warned`, `failed` or `unknown`.
     words : str
+        The result in a sentence.
     """
 
     name: str
@@ -430,15 +448,16 @@ class Head:
     ----------
     title : str
     badge : str
-        "good", "warn" or "bad".
+        "good", "warn" or "bad": colour of the status.
     status, reason : str
+        Status of the run, and why it is not verified.
     meta : str
-        Circumstances.
+        How it was computed: case, formulation, time.
     lead : str
         The conclusion.
     verdict : tuple of VerdictRow
     decision : str
-        What to do, or the answer, in a sentence or two.
+        What to do next, in a sentence or two.
     """
 
     title: str
@@ -481,7 +500,7 @@ class Page:
     head : Head
     chapters : tuple of Chapter
     index : str
-        Address of the page that links all of the run; empty where there is none.
+        Address of the page that links to all pages of the run; empty where there is none.
     """
 
     head: Head

@@ -142,8 +142,15 @@ def _beside(words: Iterable[str], folders: Iterable[Path], *, longest: int = 255
                 continue  # a folder above says nothing
             if place.is_file():
                 yield place
-            elif place.is_dir():
+            elif place.is_dir() and not _holds_run(place):
                 yield from (item for item in place.iterdir() if item.is_file())
+
+
+def _holds_run(folder: Path) -> bool:
+    """Whether a folder is that of a run, which is written while the plant is in use: a case
+    table.toml with the option "table" names its own."""
+    results = folder / "case.toml", folder / "result.json"
+    return any(folder.glob("samples*.sqlite")) or all(file.is_file() for file in results)
 
 
 Names = tuple[str, ...]

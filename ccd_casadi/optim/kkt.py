@@ -1,4 +1,12 @@
-"""Quadratic programmes, and the conditions of optimality by active sets."""
+"""Quadratic programmes, quasi-Newton updates, and first- and second-order optimality conditions.
+
+Of min J(z) over g(z) <= 0, 0 <= z <= 1 (z: shares of the box of the variables), where A has the
+gradients of the active constraints and bounds as rows:
+
+    ∇J + Aᵀμ = 0,   μ >= 0,   μᵢ gᵢ = 0,   ZᵀHZ >= 0 on the null space Z of rows with μᵢ > 0.
+
+g is in shares of a size of each constraint, so that one tolerance serves all.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,20 +28,20 @@ QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 class QuadraticOptions:
     """Numbers of quadratic programmes, in the units in which they are solved."""
 
-    row_error: float = 1e-7  # by how much a solution may exceed its rows
-    bound_error: float = 1e-6  # and its bounds, to which it can be moved
+    row_error: float = 1e-7  # largest violation of A x <= upper in a solution
+    bound_error: float = 1e-6  # of its bounds: larger, as the caller clips x to them
     primal: float = 1e-10  # DAQP's tolerances
     dual: float = 1e-12
     zero: float = 1e-13
-    unbounded: float = 1e30  # what DAQP takes for infinite
-    curvature: float = 1e-8  # of a step: its solution is then one point
-    slack_curvature: float = 1e-3  # of σ over the penalty; with less DAQP starts far out and cycles
-    first_rows: int = 200  # of a programme
-    added_rows: int = 50  # at a time, of those that its solution exceeds
+    unbounded: float = 1e30  # from here on DAQP takes a bound for infinite
+    regularisation: float = 1e-8  # added to the diagonal of H: the solution is then unique
+    slack_curvature: float = 1e-3  # of σ over ρ; with less DAQP starts far out and cycles
+    first_rows: int = 200  # of a large programme, solved for at first
+    added_rows: int = 50  # most violated rows added per round
 
 
 class QuadraticSolution(NamedTuple):
-    """x (n,) and the multipliers (m,) of the rows."""
+    """x (n,) and the multipliers (m,) >= 0 of the rows of A."""
 
     x: Array
     multipliers: Array
@@ -43,90 +51,119 @@ def solve_quadratic(
     H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array,
     options: QuadraticOptions = QuadraticOptions(),
 ) -> QuadraticSolution | None:  # fmt: skip
-    """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper; bounds may be infinite.
+    """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper, by DAQP, then by an interior point.
 
-    None where neither solver keeps the rows of A (m, n), which says nothing of x. H may be
-    nearly singular.
+    Parameters
+    ----------
+    H, c, A, upper : array (n, n), (n,), (m, n), (m,)
+        H is positive semidefinite and may be nearly singular.
+    low, high : array (n,)
+        May be infinite.
+
+    Returns
+    -------
+    QuadraticSolution or None
+        None where neither solver returns a feasible x. It does not prove that there is none.
     """
-    (rows, n), unbounded = A.shape, options.unbounded
+    (m, n), unbounded = A.shape, options.unbounded
 
-    def kept(x: Array) -> bool:
-        missed = np.maximum(low - x, x - high).max()
-        error = (A @ x - upper).max(initial=-np.inf)
-        return bool(error <= options.row_error and missed <= options.bound_error)
+    def feasible(x: Array) -> bool:
+        bound_violation = np.maximum(low - x, x - high).max()
+        row_violation = (A @ x - upper).max(initial=-np.inf)
+        return bool(row_violation <= options.row_error and bound_violation <= options.bound_error)
 
-    above, below = np.empty(n + rows), np.full(n + rows, -unbounded)
-    above[:n], above[n:] = high, upper
-    np.minimum(above, unbounded, out=above)
-    np.maximum(low, -unbounded, out=below[:n])
-    matrix = np.ascontiguousarray(A, float)
+    # DAQP's form: blower <= (x, A x) <= bupper
+    bupper, blower = np.empty(n + m), np.full(n + m, -unbounded)
+    bupper[:n], bupper[n:] = high, upper
+    np.minimum(bupper, unbounded, out=bupper)
+    np.maximum(low, -unbounded, out=blower[:n])
     x, _, flag, info = daqp.solve(
-        np.array(H, float), c, matrix, above, below, primal_tol=options.primal,
-        dual_tol=options.dual, zero_tol=options.zero,
+        np.array(H, float), c, np.ascontiguousarray(A, float), bupper, blower,
+        primal_tol=options.primal, dual_tol=options.dual, zero_tol=options.zero,
     )  # fmt: skip
-    if flag == 1 and kept(x):
+    if flag == 1 and feasible(x):
         return QuadraticSolution(x, np.maximum(info["lam"][n:], 0.0))
-    solver = _interior(n, rows)
-    found = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
-    x = np.array(found["x"]).ravel()
-    if not solver.stats()["success"] or not kept(x):
+    solver = _interior(n, m)
+    solution = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
+    x = np.array(solution["x"]).ravel()
+    if not solver.stats()["success"] or not feasible(x):
         return None
-    return QuadraticSolution(x, np.maximum(np.array(found["lam_a"]).ravel(), 0.0))
+    return QuadraticSolution(x, np.maximum(np.array(solution["lam_a"]).ravel(), 0.0))
 
 
 def solve_elastic(
-    H: Array, c: Array, slopes: Array, value: Array, elastic: Array, low: Array, high: Array,
+    H: Array, c: Array, jacobian: Array, g: Array, elastic: Array, low: Array, high: Array,
     penalty: float, radius: float, unit: float, *, free: bool = False,
     options: QuadraticOptions = QuadraticOptions(),
 ) -> tuple[Array, Array] | None:  # fmt: skip
-    """p (n,) and the multipliers (m,) of the rows of a trust-region step:
+    """The step p of a trust region with an l∞ penalty ρ (Fletcher 1987, section 12.4):
 
-        min c·p + ½ pᵀ H p + ρ σ    over  low <= p <= high, 0 <= σ,    value + slopes·p <= elastic σ
+        min c·p + ½ pᵀ H p + ρ σ    over  low <= p <= high, 0 <= σ,    g + ∇g·p <= elastic σ
 
-    σ is by how much the rows are left exceeded (l∞ penalty; Fletcher 1987, section 12.4), so that
-    there is a solution where all are elastic; with `free` it may be negative. Solved in steps of
-    one radius and with `unit`, the size of c or ρ, as one: the solvers' tolerances mean the same at
-    every radius. Of thousands of rows the first are solved for, and then those too that the answer
-    leaves exceeded, until there is none. None as in `solve_quadratic`.
+    σ is the violation that is left, so where every row is elastic there is a solution.
+
+    It is scaled to p/radius, σ/radius and to costs in `unit`: the solvers' absolute tolerances mean
+    the same at every radius. Many rows are treated as cutting planes: the first are solved for, and
+    the most violated ones are added until none is violated.
+
+    Parameters
+    ----------
+    H, c, jacobian, g : array (n, n), (n,), (m, n), (m,)
+    elastic : array (m,)
+        0 of a row that must hold.
+    low, high : array (n,)
+    penalty, radius : float
+        ρ, and the half width of the trust region.
+    unit : float
+        Size of c or ρ.
+    free : bool
+        σ may be negative (the largest row is minimised).
+
+    Returns
+    -------
+    p (n,) and the multipliers (m,) of the rows; None as in `solve_quadratic`
     """
-    m, n = slopes.shape
+    m, n = jacobian.shape  # the variables are (p, σ)/radius
     A, hessian, cost = np.empty((m, n + 1)), np.zeros((n + 1, n + 1)), np.empty(n + 1)
-    A[:, :n], A[:, n] = slopes, -elastic
+    A[:, :n], A[:, n] = jacobian, -elastic
     hessian[:n, :n], cost[:n], cost[n] = radius / unit * H, c / unit, penalty / unit
-    hessian.ravel()[:: n + 2] += options.curvature
-    ends = np.full((2, n + 1), np.inf)
-    ends[0, :n], ends[1, :n], ends[0, n] = low / radius, high / radius, -np.inf
+    hessian.ravel()[:: n + 2] += options.regularisation  # the diagonal
+    lower, higher = np.full(n + 1, -np.inf), np.full(n + 1, np.inf)
+    lower[:n], higher[:n] = low / radius, high / radius
     if not free:
-        hessian[n, n], ends[0, n] = options.slack_curvature * penalty / unit, 0.0
-    upper, held = -value / radius, np.arange(min(m, options.first_rows))
-    part: slice | np.ndarray = slice(len(held))  # the first ones are no copy
+        hessian[n, n], lower[n] = options.slack_curvature * penalty / unit, 0.0
+    upper, rows = -g / radius, np.arange(min(m, options.first_rows))
+    part: slice | np.ndarray = slice(len(rows))  # of the first rows no copy is made
     while True:
-        found = solve_quadratic(hessian, cost, A[part], upper[part], ends[0], ends[1], options)
-        if found is None:
+        solution = solve_quadratic(hessian, cost, A[part], upper[part], lower, higher, options)
+        if solution is None:
             return None
-        if len(held) == m:
+        if len(rows) == m:
             break
-        missed = A @ found.x - upper
-        missed[part] = -np.inf
-        if missed.max() <= options.row_error:
+        violation = A @ solution.x - upper
+        violation[part] = -np.inf
+        if violation.max() <= options.row_error:
             break
-        worst = np.argsort(-missed)[: options.added_rows]
-        held = part = np.concatenate([held, worst[missed[worst] > options.row_error]])
+        worst = np.argsort(-violation)[: options.added_rows]
+        rows = part = np.concatenate([rows, worst[violation[worst] > options.row_error]])
     multipliers = np.zeros(m)
-    multipliers[held] = unit * found.multipliers
-    return radius * np.clip(found.x[:n], *ends[:, :n]), multipliers
+    multipliers[rows] = unit * solution.multipliers
+    return radius * np.clip(solution.x[:n], lower[:n], higher[:n]), multipliers
 
 
 @lru_cache(maxsize=256)
-def _interior(n: int, rows: int) -> ca.Function:
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
+def _interior(n: int, m: int) -> ca.Function:
+    """CasADi's primal-dual interior point for n variables and m rows, by dense QR."""
+    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(m, n)}
     options: dict[str, bool | str] = dict.fromkeys(QUIET, False)
     options["linear_solver"] = "qr"  # an LDL factorisation would warn on the terminal
     return ca.conic("programme", "ipqp", shapes, options)
 
 
 def damped_bfgs(H: Array, s: Array, y: Array) -> Array:
-    """Update a Hessian by the curvature of a step, positive definite (BFGS, Powell's damping).
+    """Update a Hessian by BFGS with Powell's damping, which keeps it positive definite:
+
+        H - H s sᵀ H/(sᵀ H s) + ȳ ȳᵀ/(sᵀ ȳ),   ȳ = t y + (1 - t) H s,   sᵀ ȳ >= 0.2 sᵀ H s.
 
     Parameters
     ----------
@@ -146,36 +183,40 @@ def damped_bfgs(H: Array, s: Array, y: Array) -> Array:
     if curvature <= 1e-16 * float(np.trace(H)):
         return H
     if s @ y < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - float(s @ y))
-        y = share * y + (1.0 - share) * Hs
+        t = 0.8 * curvature / (curvature - float(s @ y))
+        y = t * y + (1.0 - t) * Hs
     return np.asarray(H - np.outer(Hs, Hs) / curvature + np.outer(y, y) / float(s @ y))
 
 
 def symmetric_rank_one(H: Array, s: Array, y: Array, *, least: float = 1e-8) -> Array:
-    """Update a Hessian so that H s = y, which may curve either way (SR1).
+    """Update a Hessian by SR1, H + r rᵀ/(rᵀ s) with r = y - H s. It may be indefinite.
 
     Parameters
     ----------
     H, s, y : array (n, n), (n,), (n,)
         The step s changes the gradient by y.
     least : float
-        Denominator over its factors below which it is rounding, and H stays as it is.
+        The update is skipped where |rᵀ s| <= least ‖r‖ ‖s‖: the denominator is rounding.
 
     Returns
     -------
     array (n, n)
+
+    References
+    ----------
+    J. Nocedal and S. J. Wright, Numerical Optimization, section 6.2.
     """
-    rest = y - H @ s
-    size = float(rest @ s)
-    if abs(size) <= least * float(np.linalg.norm(rest) * np.linalg.norm(s)):
+    r = y - H @ s
+    denominator = float(r @ s)
+    if abs(denominator) <= least * float(np.linalg.norm(r) * np.linalg.norm(s)):
         return H
-    return np.asarray(H + np.outer(rest, rest) / size)
+    return np.asarray(H + np.outer(r, r) / denominator)
 
 
 def convex(H: Array, least: float) -> Array:
-    """H (n, n) with its eigenvalues raised to at least `least`."""
-    values, vectors = np.linalg.eigh(H)
-    return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
+    """The symmetric H = V Λ Vᵀ (n, n) with V max(Λ, least) Vᵀ in its place."""
+    eigenvalues, V = np.linalg.eigh(H)
+    return np.asarray((V * np.maximum(eigenvalues, least)) @ V.T)
 
 
 @dataclass(frozen=True)
@@ -185,10 +226,10 @@ class KktOptions:
     Attributes
     ----------
     active : float
-        Shares of its size or the box: a closer constraint is active; a polish stops where
-        steps change J by rounding.
+        g >= -active (in shares of its size, bounds of the box) is active. A polish ends this close
+        to a constraint, as shorter steps change J by rounding only.
     step : float
-        Of the box: differences of true gradients.
+        Of central differences of true gradients, in shares of the box.
     """
 
     active: float = 1e-6
@@ -197,19 +238,22 @@ class KktOptions:
 
 @dataclass(frozen=True)
 class Kink:
-    """A design where J of θ has more than one gradient.
+    """A design at which J(θ) is continuous but not differentiable (its subdifferential is a set).
 
     Attributes
     ----------
     one_gradient : float
-        The residual with the gradient of one side alone.
+        KKT residual with the gradient of one side alone; with the whole subdifferential it is that
+        of the certificate.
     slopes : tuple of pairs
-        Of J to the two sides of each of some orthogonal directions, all that the active bounds
-        leave: differences of true values, per share of the box, over ‖∇J‖∞; NaN without a design.
+        Directional derivatives of J along ±d over ‖∇J‖∞, of orthonormal d that span the null space
+        of the active bounds: differences of true values per share of the box. NaN where there is no
+        design at a side.
     multipliers : dict
         Of the bounds on the loop by kind: change of ln of the inner value per ln of a bound.
     first_order : bool
-        The slopes are on plants to first order nearby, climbed to from the design's controller.
+        True: the values at the sides are those of plants to first order in θ and of local searches
+        from the design's controller.
     """
 
     one_gradient: float
@@ -219,9 +263,9 @@ class Kink:
 
     @property
     def least_slope(self) -> float:
-        """The least of the slopes that are known; NaN where none is."""
-        known = [slope for pair in self.slopes for slope in pair if np.isfinite(slope)]
-        return min(known, default=float("nan"))
+        """The least finite directional derivative, negative where J falls; NaN without any."""
+        finite = [slope for pair in self.slopes for slope in pair if np.isfinite(slope)]
+        return min(finite, default=float("nan"))
 
 
 @dataclass(frozen=True)
@@ -231,21 +275,22 @@ class KktCertificate:
     Attributes
     ----------
     stationarity : float
-        ‖∇J + Σ μ ∇g‖∞ over ‖∇J‖∞.
+        ‖∇J + Aᵀμ‖∞ over ‖∇J‖∞.
     primal : float
-        The largest violation of g or a bound, in shares.
+        The largest violation of g or a bound, in shares; 0 where none is violated.
     complementarity : float
-        The largest |μ g| over ‖∇J‖∞.
+        max |μᵢ gᵢ| over ‖∇J‖∞.
     multipliers : dict
-        By name: change of J per unit of g, or per unit box of a bound.
+        By name: decrease of J per unit by which a constraint is relaxed, per box width of a bound.
     active : tuple of str
+        Names of active constraints and bounds.
     second_order : float or None
-        Least eigenvalue of the reduced Hessian of the Lagrangian over ‖∇J‖∞; inf at a vertex, None
-        where it was not computed.
+        Least eigenvalue of the reduced Hessian ZᵀHZ of the Lagrangian over ‖∇J‖∞; inf at a vertex,
+        where Z has no columns, None where it was not computed.
     objective_gradient : tuple of float (n,)
-        ∇J per unit box.
+        ∇J per box width.
     kink : Kink or None
-        Where J has more than one gradient.
+        Where J is not differentiable.
     """
 
     stationarity: float
@@ -260,7 +305,7 @@ class KktCertificate:
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First derivatives of J and of constraints g at one z of the unit box.
+    """Constraints g <= 0 and first derivatives of J and g at one z of the unit box.
 
     Attributes
     ----------
@@ -268,7 +313,9 @@ class FirstOrder:
         ∇J.
     g, jacobian : array (m,), (m, n)
         In shares of `sizes`.
-    sizes, names : array (m,), tuple of str
+    sizes : array (m,)
+        One share of each constraint, in its unit.
+    names : tuple of str
     """
 
     gradient: Array
@@ -287,12 +334,12 @@ class ActiveSet:
     gradient : array (n,)
         ∇J.
     rows, slack, sizes : array (m, n), (m,), (m,)
-        Slopes and values, <= 0 inside, in shares of the sizes.
+        A and the values g, <= 0 where feasible, in shares of the sizes; 1 is the size of a bound.
     labels : tuple of str
     constraints : int
-        So many of the first rows are of g, the others of bounds.
+        The number of rows of g; those of bounds follow.
     violation : float
-        The largest of all constraints, active or not; 0 where none is violated.
+        max(g, 0) over all constraints and bounds, active or not.
     """
 
     gradient: Array
@@ -309,7 +356,7 @@ class ActiveSet:
         return max(float(np.abs(self.gradient).max()), 1e-300)
 
     def multipliers(self) -> Array:
-        """The best μ >= 0 (m,), per share."""
+        """Least-squares multipliers μ >= 0 (m,) of ∇J + Aᵀμ = 0, per share."""
         return non_negative(self.rows, -self.gradient)[0]
 
     def residual(self, mu: Array) -> float:
@@ -317,13 +364,13 @@ class ActiveSet:
         return float(np.abs(self.gradient + mu @ self.rows).max()) / self.size
 
     def free(self, mu: Array) -> Array:
-        """Orthonormal directions (n, k) that leave what has a multiplier as it is."""
+        """Z (n, k), an orthonormal basis of the null space of the rows with μ > 0."""
         return np.asarray(null_space(self.rows[mu > 0.0]))
 
     def certificate(
         self, mu: Array, residual: float, second: float | None, kink: Kink | None = None
     ) -> KktCertificate:
-        """What was found, with multipliers per unit of g."""
+        """The certificate, with multipliers per unit of g instead of per share."""
         per_unit = zip(self.labels, mu / self.sizes, strict=True)
         return KktCertificate(
             stationarity=residual,
@@ -338,7 +385,7 @@ class ActiveSet:
 
 
 def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
-    """Find the multipliers μ >= 0 with the least ‖rowsᵀ μ - goal‖₂.
+    """Find the multipliers μ >= 0 with the least ‖rowsᵀ μ - goal‖₂, by non-negative least squares.
 
     Parameters
     ----------
@@ -357,36 +404,37 @@ def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
 
 
 def active_set(
-    z: Array, here: FirstOrder, variables: Sequence[str], *, active: float = KktOptions.active
+    z: Array, first: FirstOrder, variables: Sequence[str], *, active: float = KktOptions.active
 ) -> ActiveSet:
-    """Collect what binds at a point of the unit box.
+    """Collect the active constraints and bounds at a point of the unit box.
 
     Parameters
     ----------
-    z, here : array (n,), FirstOrder
+    z, first : array (n,), FirstOrder
+        The point, and its first derivatives.
     variables : sequence of str (n,)
         Names of the components of z, by which their bounds are labelled.
     active : float
-        Shares of its size or of the box within which a constraint g <= 0 or a bound binds.
+        As in `KktOptions`.
 
     Returns
     -------
     ActiveSet
     """
-    at = np.flatnonzero(here.g >= -active)
-    rows, slack, units = ([*each[at]] for each in (here.jacobian, here.g, here.sizes))
-    labels, count = [here.names[i] for i in at], len(at)
+    chosen = np.flatnonzero(first.g >= -active)
+    rows, slack, sizes = ([*each[chosen]] for each in (first.jacobian, first.g, first.sizes))
+    labels, count = [first.names[i] for i in chosen], len(chosen)
     for i, name in enumerate(variables):
         for end, value, sign in (("lower", -z[i], -1.0), ("upper", z[i] - 1.0, 1.0)):
             if value >= -active:
                 rows.append(sign * np.eye(z.size)[i])
                 labels.append(f"{name} {end}")
                 slack.append(value)
-                units.append(1.0)
-    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *here.g)
-    matrix = np.array(rows).reshape(-1, z.size)
+                sizes.append(1.0)
+    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *first.g)
+    A = np.array(rows).reshape(-1, z.size)
     return ActiveSet(
-        here.gradient, matrix, np.array(slack), np.array(units), tuple(labels), count, violation
+        first.gradient, A, np.array(slack), np.array(sizes), tuple(labels), count, violation
     )
 
 
@@ -396,14 +444,14 @@ def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | N
     Parameters
     ----------
     Z, columns : array (n, k), (n, k) or None
-        Free directions; HZ, None or NaN where it is not known.
+        Z, a basis of the null space of the active constraints, and HZ.
     size : float
-        What the eigenvalue is divided by.
+        ‖∇J‖∞, by which the eigenvalue is divided.
 
     Returns
     -------
     float or None
-        inf at a vertex (k = 0), None where HZ is not known.
+        inf at a vertex (k = 0), None where HZ is None or has NaN.
     """
     if Z.shape[1] == 0:
         return np.inf
@@ -414,32 +462,33 @@ def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | N
 
 
 def hessian_products(
-    slopes: Callable[[Array], Sequence[Array | None]],
+    gradients: Callable[[Array], Sequence[Array | None]],
     z: Array,
     directions: Array,
     step: float = KktOptions.step,
 ) -> Array | None:
-    """Multiply a Hessian by directions: differences of gradients, one-sided at an end of the box.
+    """Multiply a Hessian by directions d: (∇J(z + h d) - ∇J(z - h d))/2h, of which a side outside
+    the box is clipped to it.
 
     Parameters
     ----------
-    slopes : callable
-        Gradients at many points: z (2k, n) to 2k arrays (n,), None where one is not known.
+    gradients : callable
+        Of J at many points: z (2k, n) to 2k arrays (n,), None where there is none.
     z, directions : array (n,), (n, k)
-        In the unit box; Z.
+        In the unit box; orthonormal columns d.
     step : float
-        Of the box.
+        h, in shares of the box.
 
     Returns
     -------
     array (n, k) or None
-        HZ; None where a gradient is not known, or the box leaves less than half of a step.
+        None where a gradient is missing, or clipping leaves points closer than h/2.
     """
-    ends = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
-    found = [slope for slope in slopes(ends) if slope is not None]
-    ups, downs = np.split(ends, 2)
-    spans = np.linalg.norm(ups - downs, axis=1)
-    if len(found) < len(ends) or (spans < 0.5 * step).any():
+    points = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
+    values = [gradient for gradient in gradients(points) if gradient is not None]
+    forward, backward = np.split(points, 2)
+    distance = np.linalg.norm(forward - backward, axis=1)
+    if len(values) < len(points) or (distance < 0.5 * step).any():
         return None
-    above, below = np.split(np.array(found), 2)
-    return np.asarray(((above - below) / spans[:, None]).T)
+    at_forward, at_backward = np.split(np.array(values), 2)
+    return np.asarray(((at_forward - at_backward) / distance[:, None]).T)

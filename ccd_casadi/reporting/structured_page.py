@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import binding, facts, gain_words, paragraph
 from ccd_casadi.reporting.gain_figures import bandwidth_level, forbidden, over_hz, sensitivity_panel
-from ccd_casadi.reporting.nyquist import near, nyquist_panel
+from ccd_casadi.reporting.nyquist import drawable, nyquist_panel
 from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.support.text import HZ, counted, number, spoken
 from ccd_casadi.synthesis.closed_loop import measure
@@ -185,7 +185,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
     ends = (float(hz[0]), float(hz[-1]))
     top = 2.5 * max(bounds.S_max, *(float(curve.y.max()) for curve in curves["S"]))
     at = bandwidth_level(answer["bandwidth_hz"])
-    shown = [near(L) for L in loci]
+    shown = [drawable(L) for L in loci]
     rows = (
         (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",

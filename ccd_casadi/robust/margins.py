@@ -1,4 +1,8 @@
-"""Margins of a loop, and its signals under noise."""
+"""Margins and norms of a loop, and the RMS of its signals under white noise.
+
+Of a plant G (p outputs, m inputs) and a controller K: S = (1 + GK)⁻¹, T = 1 - S. Frequencies are
+in rad/s unless a name is or ends in `hz`.
+"""
 
 import math
 from collections.abc import Callable
@@ -29,7 +33,8 @@ from ccd_casadi.synthesis.closed_loop import PlantAndController, classical_margi
 
 @dataclass(frozen=True)
 class Noise:
-    """RMS of every output and every input under given densities; inf where they are not finite."""
+    """RMS of position (p,) in m and of force (m,) in N under white sensor noise, and under a white
+    disturbance; inf where the variance is not finite."""
 
     position_by_noise: Array
     force_by_noise: Array
@@ -38,29 +43,33 @@ class Noise:
 
 
 def gains(G: NDArray, K: NDArray) -> Array:
-    """σ_max of S, T, GS (disturbance force to position) and KS (noise to force), rows (4, k)."""
-    found = responses_of(G, K)
-    return np.array([sigma_max(found[name]) for name in ("S", "T", "GS", "KS")])
+    """σ_max of S, T, GS (disturbance force to position) and KS (noise to force), (4, k).
+
+    From the responses G (k, p, m) and K (k, m, p) at k frequencies.
+    """
+    closed_loop = responses_of(G, K)
+    return np.array([sigma_max(closed_loop[name]) for name in ("S", "T", "GS", "KS")])
 
 
 def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
-    """‖·‖∞ of S, T, GS and KS, each with its frequency in rad/s (0: at rest), without a grid."""
+    """(‖·‖∞, ω) of S, T, GS and KS in continuous time, ω of the peak. No grid: `hinf_norm`."""
     return tuple(hinf_norm(part) for part in (loop.S, loop.T, loop.GS, loop.KS))
 
 
 def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, float], ...]:
-    """The largest value of each row of gains (r, k), climbed from a grid in rad/s, and its ω.
+    """(peak, ω) of each row of `gain`: ω (k,) to (r, k), for loops in discrete time.
 
-    Of a loop in discrete time, from far below the grid to its end.
+    The grid's largest value brackets the peak, which is refined between its neighbours. One point
+    far below the grid stands for ω = 0. The grid ends at π/T.
     """
-    omega = np.concatenate([1e-3 * omega[:1], omega])  # a constant signal
-    values, found = gain(omega), []
+    omega = np.concatenate([1e-3 * omega[:1], omega])
+    values, peaks = gain(omega), []
     for row, i in enumerate(values.argmax(axis=1)):
-        ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
-        top = refine_peak(partial(_of_row, gain, row), *ends)
-        tops = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
-        found.append(max(tops, top[::-1]) if i else tops)
-    return tuple(found)
+        bracket = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
+        refined = refine_peak(partial(_of_row, gain, row), *bracket)[::-1]
+        on_grid = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
+        peaks.append(max(on_grid, refined) if i else on_grid)
+    return tuple(peaks)
 
 
 def _of_row(gain: Callable[[Array], Array], row: int, omega: float) -> float:
@@ -68,28 +77,34 @@ def _of_row(gain: Callable[[Array], Array], row: int, omega: float) -> float:
 
 
 def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
-    """RMS values for white sensor noise (m/√Hz) and white force at every input (N/√Hz).
+    """RMS for white sensor noise (one-sided density, m/√Hz) and white force at every input (N/√Hz).
 
-    They are those of an error budget of both sources: of a sampled loop at its instants.
+    The covariance P of the states solves Lyapunov's equation; position C x has the variances
+    diag(C P Cᵀ), force F x + V ν those of F P Fᵀ + V Vᵀ. In continuous time V ≠ 0 (a controller
+    with feedthrough) makes the force white, of infinite variance. Of a sampled loop these are the
+    values at its sampling instants.
     """
-    found = []
+    rms = []
     for kind, density in ((SourceKind.SENSOR_NOISE, sensor), (SourceKind.FORCE, disturbance)):
-        of = process(loop, ErrorSource(kind.value, kind, ShapedSpectrum(density**2))).balanced()
-        P = Lyapunov(of.A, sampled=of.sampled).covariance(of.noise)
-        position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (of.C, of.F))
-        force = np.full_like(force, np.inf) if of.infinite_force else force + (of.V**2).sum(1)
-        found += [np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(force, 0.0))]
-    return Noise(*found)
+        model = process(loop, ErrorSource(kind.value, kind, ShapedSpectrum(density**2))).balanced()
+        P = Lyapunov(model.A, sampled=model.sampled).covariance(model.noise)
+        position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (model.C, model.F))
+        force = np.full_like(force, np.inf) if model.infinite_force else force + (model.V**2).sum(1)
+        rms += [np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(force, 0.0))]
+    return Noise(*rms)
 
 
 @dataclass(frozen=True)
 class DiskMargin:
-    """The disk margin of a loop (balanced, σ = 0): 1/α = ‖S - ½‖∞, of channels its bound on μ.
+    """The balanced disk margin α (skew 0): stable under factors (1 + ½δ)/(1 - ½δ) of L, |δ| < α.
+
+    1/α = max_ω μ(S - ½), where μ is |S - ½| of one channel; of several channels with an independent
+    δ each it is replaced by its upper bound, and α is a lower bound.
 
     Attributes
     ----------
     alpha, hz : float
-        α, and where it is least.
+        α, and the frequency of the maximum.
 
     References
     ----------
@@ -101,22 +116,31 @@ class DiskMargin:
 
     @property
     def gain(self) -> float:
-        """The loop's gain may be multiplied by anything from 1/gain to gain."""
+        """The loop is stable under any factor of its gain between 1/gain and gain."""
         return (2.0 + self.alpha) / (2.0 - self.alpha) if self.alpha < 2.0 else math.inf
 
     @property
     def phase_deg(self) -> float:
-        """And its phase changed by less than this."""
+        """The loop is stable under any change of its phase by less than this, at the same gain."""
         return math.degrees(2.0 * math.atan(self.alpha / 2.0))
 
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """One loop broken at a plant output or input, the others closed.
+    """Margins of one loop broken at a plant output or input, the others closed.
 
-    `gain_up` and `gain_down` are the nearest factors above and below 1 at which stability is lost
-    (inf and 0 where there are none), `phase_deg` the least phase margin, `crossover_hz` the first
-    frequency at which |L| falls through 1.
+    Attributes
+    ----------
+    name : str
+        "output 1", "input 2", ...
+    gain_up, gain_down : float
+        Nearest factors above and below 1 at which stability is lost; inf and 0 where there is none.
+    phase_deg : float
+        Least phase margin over all crossings of |L| = 1.
+    crossover_hz : float
+        Where |L| falls through 1, and is above 1 below and below 1 above over most of ln ω: not at
+        a resonance further up.
+    disk : DiskMargin
     """
 
     name: str
@@ -129,7 +153,7 @@ class LoopMargins:
 
 @dataclass(frozen=True)
 class Margins:
-    """Of every loop alone, and of all outputs, or all inputs, at once."""
+    """Margins of each loop alone, and disk margins with a δ at all outputs, or inputs, at once."""
 
     loops: tuple[LoopMargins, ...]
     outputs: DiskMargin
@@ -137,48 +161,57 @@ class Margins:
 
 
 def margins(respond: PlantAndController, hz: Array) -> Margins:
-    """Margins of a loop from its responses in SI, on a grid in Hz that resolves resonances.
+    """Margins of a loop from its responses.
 
-    The grid only brackets: crossings are bisected on the response itself, and the least disk margin
-    is searched again between its neighbours. Of a sampled loop the grid ends at half its rate.
+    Parameters
+    ----------
+    respond : callable
+        ω (k,) to G (k, p, m) and K (k, m, p), SI.
+    hz : array (k,)
+        A grid that resolves resonances; of a sampled loop up to half its rate. It only brackets:
+        crossings are bisected on the response itself, and the least disk margin is evaluated again
+        on a finer grid between its neighbours.
     """
-    loops, together = [], []
+    loops, multiloop = [], []
     for name in ("output", "input"):
-        L = partial(_broken, respond, name)
+        L = partial(_open_loop, respond, name)
         for i in range(L(HZ * hz[:1]).shape[1]):
-            loops.append(_loop(f"{name} {i + 1}", partial(_alone, L, i), hz))
-        together.append(_least(L, hz))
-    return Margins(tuple(loops), *together)
+            loops.append(_loop_margins(f"{name} {i + 1}", partial(_one_channel, L, i), hz))
+        multiloop.append(_disk_margin(L, hz))
+    return Margins(tuple(loops), *multiloop)
 
 
-def _broken(respond: PlantAndController, name: str, omega: Array) -> NDArray:
+def _open_loop(respond: PlantAndController, name: str, omega: Array) -> NDArray:
+    """L = GK (k, p, p), broken at the outputs, or KG (k, m, m), broken at the inputs."""
     G, K = respond(omega)
     return np.asarray(G @ K if name == "output" else K @ G)
 
 
-def _alone(L: Callable[[Array], NDArray], i: int, omega: Array) -> NDArray:
+def _one_channel(L: Callable[[Array], NDArray], i: int, omega: Array) -> NDArray:
+    """(k,) the scalar open loop of channel i, the others closed."""
     return equivalent_open_loop(L(omega), i)
 
 
-def _loop(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:
-    found = classical_margins(L, HZ * hz)
+def _loop_margins(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:
+    classical = classical_margins(L, HZ * hz)
     return LoopMargins(
         name=name,
-        gain_up=found.gain_up,
-        gain_down=found.gain_down,
-        phase_deg=found.phase_deg,
-        crossover_hz=found.crossover / HZ,
-        disk=_least(lambda omega: L(omega)[:, None, None], hz),
+        gain_up=classical.gain_up,
+        gain_down=classical.gain_down,
+        phase_deg=classical.phase_deg,
+        crossover_hz=classical.crossover / HZ,
+        disk=_disk_margin(lambda omega: L(omega)[:, None, None], hz),
     )
 
 
-def _least(L: Callable[[Array], NDArray], hz: Array, *, points: int = 61) -> DiskMargin:
-    """The least disk margin of all channels at once on the grid, then at `points` around it."""
-    for last in (False, True):
+def _disk_margin(L: Callable[[Array], NDArray], hz: Array, *, points: int = 61) -> DiskMargin:
+    """The least disk margin with a δ in each channel of L (k, n, n): on the grid, then at `points`
+    between the neighbours of its minimum."""
+    for refined in (False, True):
         eye = np.eye((response := L(HZ * hz)).shape[1])
         alpha = 1.0 / mu_bound(sensitivity(response) - 0.5 * eye)
         worst = int(alpha.argmin())
-        found = DiskMargin(float(alpha[worst]), float(hz[worst]))
-        if not last:
+        margin = DiskMargin(float(alpha[worst]), float(hz[worst]))
+        if not refined:
             hz = np.geomspace(hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)], points)
-    return found
+    return margin

@@ -1,10 +1,12 @@
-"""Sampling on a Dask cluster, by the interface of the process pool: nothing lost, nothing twice.
+"""Sampling on a Dask cluster, with the interface of the process pool (`process_pool.Pool`).
 
-Dask runs a task again where its worker dies. Where scheduler or workers stay away the command ends,
-and the same command resumes from the samples that it has kept.
+Each task gives exactly one result. Dask repeats a task whose worker died. If the scheduler or all
+workers remain unreachable, the command ends with `WorkerLost`; the same command resumes from the
+samples in its store.
 
-Messages are pickled, as Dask's own are: scheduler and workers can run what they like here, so the
-address must be one's own; docs/development/cluster.md shows TLS for it. None is stored.
+Security: messages are pickled, as Dask's own are, so a scheduler or a worker can execute any code
+in this process. Connect only to your own; docs/development/cluster.md shows TLS for it. No pickle
+is stored.
 """
 
 import logging
@@ -28,75 +30,76 @@ from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message, 
 class ClusterOptions:
     """Times of a connection to a cluster, s."""
 
-    connect: float = 10.0  # for the scheduler to answer at first, and for a worker to be there
-    close: float = 1.0  # at the end, when nothing depends on it: Ctrl-C ends within 2 s
-    poll: float = 0.02  # between two checks of the answers, and of the workers
+    connect: float = 10.0  # at most, until the scheduler answers and until it has a worker
+    close: float = 1.0  # at most, to disconnect: Ctrl-C must end the command within 2 s
+    poll: float = 0.02  # between two checks for results and for workers
 
 
-_one_at_a_time = threading.Lock()
+_one_task = threading.Lock()
 
 
 def pool(scheduler: str | None, count: int, patience: float) -> Pool:
-    """The processes of a command.
+    """Make the pool of a command: local processes, or a Dask cluster.
 
     Parameters
     ----------
     scheduler : str or None
-        Address of a Dask scheduler.
+        Address of a Dask scheduler; None: local processes.
     count : int
-        Processes here, without a scheduler.
+        Local processes at most.
     patience : float
-        Work that starting these is not worth, s.
+        Work in s below which no local processes are started.
 
     Returns
     -------
     Pool
-        To be entered.
+        A context manager that has not been entered.
     """
     return Workers(count, patience) if scheduler is None else Cluster(scheduler)
 
 
 class Cluster:
-    """The workers of a Dask scheduler; a single task runs in this process.
+    """A pool of the workers of a Dask scheduler; a single task runs in this process.
 
-    Assumes that the workers have this package, and a user's plant file under the same path.
+    Every worker needs this package, and the user's plant file under the same path.
     """
 
     def __init__(
         self, address: str, absence: float = 300.0, options: ClusterOptions = ClusterOptions()
     ) -> None:
-        """`absence`: s to wait for workers where all are gone."""
+        """`absence`: time in s without any worker after which a map raises WorkerLost."""
         self.options = options
         self.address, self.absence, self.count = address, absence, 1
         self._client: Any = None
-        self._manned, self._mapping = 0.0, False
+        self._last_worker_seen, self._mapping = 0.0, False  # by the monotonic clock, s
 
     def __enter__(self) -> Self:
-        """Connect. Raises UserError where Dask is not installed, or nothing answers there."""
+        """Connect. Raises UserError where Dask is not installed, the address is none, or there is
+        no scheduler or no worker."""
         try:
             import distributed
         except ImportError:
-            words = "Dask, which is not installed; run: python -m pip install dask distributed"
-            raise UserError(f"--scheduler needs {words}") from None
+            message = "Dask, which is not installed; run: python -m pip install dask distributed"
+            raise UserError(f"--scheduler needs {message}") from None
         for name in ("distributed", "distributed.client", "asyncio"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # losses are dealt with here
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # losses are reported here
         if not re.fullmatch(r"\w+://.+:\d+", self.address):
-            what = "what `dask scheduler` prints, for instance tcp://127.0.0.1:8786"
-            raise self._mistake(f"is not an address; give {what}")
+            example = "what `dask scheduler` prints, for instance tcp://127.0.0.1:8786"
+            raise self._user_error(f"is not an address; give {example}")
         try:
             self._client = distributed.Client(
                 self.address, timeout=self.options.connect, set_as_default=False
             )
-        except Exception as error:  # whatever the transport of that address raises
-            words = f"no Dask scheduler answers there ({error}); start one with `dask scheduler`"
-            raise self._mistake(f"{words} and give the address that it prints") from error
+        except Exception as error:  # each transport of Dask (tcp, tls, ucx) raises its own
+            message = f"no Dask scheduler answers there ({error}); start one with `dask scheduler`"
+            raise self._user_error(f"{message} and give the address that it prints") from error
         try:
             self._client.wait_for_workers(1, timeout=self.options.connect)
         except TimeoutError:
             self._close()
-            words = f"has no workers; start some with `dask worker {self.address} --nthreads 1`"
-            raise self._mistake(words) from None
-        self._survey()
+            message = f"has no workers; start some with `dask worker {self.address} --nthreads 1`"
+            raise self._user_error(message) from None
+        self._count_workers()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -105,9 +108,9 @@ class Cluster:
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:
-        """Results as they complete, each once.
+        """Yield results as they complete, each once.
 
-        Raises as `Pool` says, and WorkerLost where scheduler or workers stay away.
+        Raises as `Pool.map_unordered`, and WorkerLost where scheduler or workers are gone for good.
         """
         if len(tasks) <= 1:
             yield from map(function, tasks)
@@ -116,69 +119,76 @@ class Cluster:
             raise RuntimeError("this cluster is busy with another map: finish or close that one")
         from distributed import as_completed
 
-        self._mapping, self._manned = True, time.monotonic()
+        self._mapping, self._last_worker_seen = True, time.monotonic()
         messages = [pickle.dumps((function, task)) for task in tasks]
+        # pure=False: Dask may not take a result from an equal task of an earlier map
         futures = [self._client.submit(serve, NUMERICS, m, pure=False) for m in messages]
-        arriving = as_completed(futures, loop=self._client.loop)
+        completed = as_completed(futures, loop=self._client.loop)
         try:
-            while not arriving.is_empty():
-                for future in arriving.next_batch(block=False):
-                    yield self._answer(future)
-                self._survey()
+            while not completed.is_empty():
+                for future in completed.next_batch(block=False):
+                    yield self._result(future)
+                self._count_workers()
                 time.sleep(self.options.poll)
         finally:
             self._mapping = False
-            with suppress(Exception):  # the connection is closed already
+            with suppress(Exception):  # the connection may be closed already
                 self._client.cancel(futures)
 
-    def _answer(self, future: Any) -> Any:
+    def _result(self, future: Any) -> Any:
+        """The value of a task, or its exception raised."""
         from distributed import KilledWorker
 
         try:
-            done, value = pickle.loads(future.result())  # of a worker that runs our code anyway
+            succeeded, value = pickle.loads(future.result())  # trusted: see the module
         except KilledWorker:
             raise WorkerLost("worker after worker died on one task (out of memory?)") from None
         except (CancelledError, OSError) as error:
-            raise self._away("scheduler") from error
-        except Exception as error:
-            raise self._mistake(
+            raise self._lost("scheduler") from error
+        except Exception as error:  # of `serve` itself: exceptions of a task are values
+            raise self._user_error(
                 f"a worker cannot run our tasks ({type(error).__name__}: {error}); "
                 "install the same version of this package in every worker's environment"
             ) from error
-        if not done:
+        if not succeeded:
             raise value
         return value
 
-    def _survey(self) -> None:
-        """Count the workers. Raises WorkerLost where nobody is there any more."""
+    def _count_workers(self) -> None:
+        """Update `count`. Raises WorkerLost without a scheduler, or without workers for too long.
+
+        A short absence is tolerated: workers may restart.
+        """
         if self._client.status != "running":
-            raise self._away("scheduler")
-        found = int(self._client.scheduler_info(n_workers=0).get("n_workers", 0))
-        self.count, now = max(found, 1), time.monotonic()
-        if found:
-            self._manned = now
-        elif now - self._manned > self.absence:
-            raise self._away("worker")
+            raise self._lost("scheduler")
+        workers = int(self._client.scheduler_info(n_workers=0).get("n_workers", 0))
+        self.count, now = max(workers, 1), time.monotonic()
+        if workers:
+            self._last_worker_seen = now
+        elif now - self._last_worker_seen > self.absence:
+            raise self._lost("worker")
 
     def _close(self) -> None:
         with suppress(TimeoutError, OSError):
             self._client.close(timeout=self.options.close)
 
-    def _mistake(self, words: str) -> UserError:
-        return UserError(f"--scheduler {self.address}: {words}")
+    def _user_error(self, message: str) -> UserError:
+        return UserError(f"--scheduler {self.address}: {message}")
 
-    def _away(self, what: str) -> WorkerLost:
-        words = f"the {what} is gone; start `dask {what}` again"
-        return WorkerLost(f"--scheduler {self.address}: {words}, and the same command resumes")
+    def _lost(self, part: str) -> WorkerLost:
+        message = f"the {part} is gone; start `dask {part}` again"
+        return WorkerLost(f"--scheduler {self.address}: {message}, and the same command resumes")
 
 
 def serve(numerics: int, message: bytes) -> bytes:
-    """On a worker: the answer to one message, with one BLAS thread.
+    """Run one task on a worker, with one BLAS thread: pickled (function, task) to pickled
+    (succeeded, result or exception).
 
-    One task at a time, even where a worker has several threads: CasADi's functions, and the
-    limit on threads, belong to the process.
+    `numerics` is the client's version; a worker with another would return other digits. One task at
+    a time, even if a worker has several threads: CasADi's functions and the limit on BLAS threads
+    are shared by the process.
     """
     if numerics != NUMERICS:
         raise RuntimeError(f"the worker's numerics are version {NUMERICS}, ours are {numerics}")
-    with _one_at_a_time, one_blas_thread:
+    with _one_task, one_blas_thread:
         return answer_message(message)

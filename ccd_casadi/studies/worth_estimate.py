@@ -1,4 +1,9 @@
-"""The sequential baseline, and what co-design gains over it, from a few true designs."""
+"""The sequential design, and an estimate of what co-design gains over it.
+
+Sequential: the hardware of least cost f(θ) whose first resonance meets a rule of thumb, then its
+best controller. Co-design is estimated by Bayesian optimisation of J = w₁ f(θ) + w₂ ω_b*(θ) with
+few true inner problems. Frequencies are in rad/s unless a name ends in _hz.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -47,26 +52,30 @@ from surrogates import design, to_casadi
 
 @dataclass(frozen=True)
 class HardwareOptions:
-    """Numbers of the sequential hardware design on cheap models of the plant.
+    """Numbers of the sequential hardware design, on cheap models of a plant of finite elements.
 
     Attributes
     ----------
     rounds : int
-        Solves at most, each on a model that is made of the θ known so far.
-    agreed : float
-        Relative difference of ω_1 between model and plant that ends them.
-    known : int
-        θ that a model is made of.
+        Solves at most, each on a model through the last solutions.
+    tolerance : float
+        Relative difference of ω_1 between model and plant at which they end, and by which ω_1 may
+        be below its bound.
+    model_points : int
+        The last θ at which the plant is evaluated, through which a model passes.
     """
 
     rounds: int = 8
-    agreed: float = 1e-6
-    known: int = 3
+    tolerance: float = 1e-6
+    model_points: int = 3
 
 
 @dataclass(frozen=True)
 class HardwareDesign:
-    """The hardware that the rule of thumb gives; resonance in rad/s; `met` False: none meets it."""
+    """The hardware θ of least cost by the rule of thumb, its cost f(θ) and ω_1.
+
+    `met`: whether it meets the rule and the constraints; if not, it has the largest ω_1 found.
+    """
 
     theta: tuple[float, ...]
     hardware_cost: float
@@ -77,7 +86,10 @@ class HardwareDesign:
 def first_resonance(
     problem: CoDesignProblem, theta: Array, evaluate: Evaluate | None = None
 ) -> tuple[float, Array]:
-    """ω_1 of the first flexible mode, rad/s, and its gradient to θ; NaN where all is rigid."""
+    """ω_1 of the first flexible mode in rad/s and ∂ω_1/∂θ = φᵀ(K' - ω_1² M')φ/(2ω_1), (n,).
+
+    NaN where all modes are rigid. `evaluate`: a model in place of the plant.
+    """
     system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
     modal = modal_plant(system, problem.suspension.free)
     flexible = np.flatnonzero(~modal.rigid)
@@ -85,8 +97,8 @@ def first_resonance(
         return np.nan, np.full(len(theta), np.nan)
     i = int(flexible[0])
     omega = float(modal.natural[i])
-    slope = modal.dK[:, i, i] - omega**2 * modal.dM[:, i, i]
-    return omega, slope / (2.0 * omega)
+    eigenvalue_slope = modal.dK[:, i, i] - omega**2 * modal.dM[:, i, i]
+    return omega, eigenvalue_slope / (2.0 * omega)
 
 
 def design_hardware(
@@ -98,55 +110,68 @@ def design_hardware(
     workers: Pool | None = None,
     options: HardwareOptions = HardwareOptions(),
 ) -> HardwareDesign:
-    """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
+    """Minimise f(θ) over ω_1(θ) >= resonance, λ(θ) <= 0 and the box of θ, by IPOPT.
 
-    From the case's start and `starts` more: with none, the local solution next to the start,
-    which need not be the least one (for the two masses it is the paper's equal-mass design).
+    Parameters
+    ----------
+    resonance : float
+        rad/s.
+    starts : int
+        Sobol points from which it is solved besides the case's start. With none it is the local
+        optimum next to that start, which need not be the least one (for the two masses it is the
+        paper's equal-mass design).
     """
     points = [problem.start]
     if starts > 0:
         points += map(tuple, design("sobol", *box(problem), starts, seed).tolist())
     tasks = {start: (problem, resonance, start, options) for start in points}
-    found = [design for _, design in sorted(results(workers, _from_start, tasks))]
-    nearest = max(found, key=lambda item: item.first_resonance)
-    meeting = (item for item in found if item.met)
-    return min(meeting, key=lambda item: item.hardware_cost, default=nearest)
+    ends = [end for _, end in sorted(results(workers, _from_start, tasks))]
+    highest = max(ends, key=lambda end: end.first_resonance)
+    feasible = (end for end in ends if end.met)
+    return min(feasible, key=lambda end: end.hardware_cost, default=highest)
 
 
 def _from_start(
     problem: CoDesignProblem, resonance: float, start: tuple[float, ...], options: HardwareOptions
 ) -> HardwareDesign:
+    """The local optimum next to a start; of an expensive plant by a sequence of models, each exact
+    at the last solutions."""
     plant = plant_of(problem)
-    known: tuple[tuple[float, ...], ...] = (start,)
+    solutions: tuple[tuple[float, ...], ...] = (start,)
     for _ in range(options.rounds):
-        evaluate = None if plant.nearby is None else plant.nearby(known)
-        point, predicted = _least_cost(problem, resonance, known[-1], evaluate)
-        omega = predicted if evaluate is None else first_resonance(problem, point)[0]
+        model = None if plant.nearby is None else plant.nearby(solutions)
+        point, predicted = _least_cost(problem, resonance, solutions[-1], model)
+        omega = predicted if model is None else first_resonance(problem, point)[0]
         theta = tuple(float(v) for v in point)
-        if abs(predicted / omega - 1.0) <= options.agreed or np.isnan(omega):
+        if abs(predicted / omega - 1.0) <= options.tolerance or np.isnan(omega):
             break
-        known = (*known[1 - options.known :], theta)
-    met = bool(omega >= resonance * (1.0 - options.agreed)) and not violated(problem, point)
+        solutions = (*solutions[1 - options.model_points :], theta)
+    met = bool(omega >= resonance * (1.0 - options.tolerance)) and not violated(problem, point)
     return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
 
 
 def _least_cost(
     problem: CoDesignProblem, resonance: float, start: tuple[float, ...], evaluate: Evaluate | None
 ) -> tuple[Array, float]:
-    """θ of the least cost near a start, and ω_1 there, by one way to evaluate the plant."""
+    """Minimise f(θ)/|f(start)| over ln(resonance/ω_1) <= 0 and λ/size <= 0 from a start: θ and ω_1.
+
+    The start where IPOPT fails. `evaluate`: a model in place of the plant.
+    """
     plant = plant_of(problem)
     theta = ca.MX.sym("theta", len(start))
     cost, lam = plant.hardware(theta)
-    at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point), evaluate))
-    callback = VectorCallback(
+    resonance_at = lru_cache(maxsize=None)(
+        lambda point: first_resonance(problem, np.array(point), evaluate)
+    )
+    log_ratio = VectorCallback(
         "first_resonance", len(start), 1,
-        lambda x: np.array([np.log(at(tuple(x))[0] / resonance)]),
-        lambda x: at(tuple(x))[1][None] / at(tuple(x))[0],
+        lambda x: np.array([np.log(resonance_at(tuple(x))[0] / resonance)]),
+        lambda x: resonance_at(tuple(x))[1][None] / resonance_at(tuple(x))[0],
     )  # fmt: skip
     program = NonlinearProgram(
         x=theta,
         f=cost / (abs(hardware_cost(plant, start)) or 1.0),
-        g=ca.vertcat(-callback(theta), lam / ca.DM(constraint_sizes(problem))),
+        g=ca.vertcat(-log_ratio(theta), lam / ca.DM(constraint_sizes(problem))),
         box=box(problem),
         exact_hessian=False,
     )
@@ -154,7 +179,7 @@ def _least_cost(
         point = solve_program(program, np.array([start])).best.x
     except OuterFailure:
         point = np.array(start)
-    return point, at(tuple(point))[0]
+    return point, resonance_at(tuple(point))[0]
 
 
 @dataclass(frozen=True)
@@ -164,23 +189,24 @@ class WorthOptions:
     Attributes
     ----------
     slow : float
-        Processor time in s of a plant at a θ from which it is slow (finite elements).
+        Processor time in s of one evaluation of the plant, above which it counts as slow (finite
+        elements).
     points, points_slow : int
-        True inner problems over the box for each parameter; of a slow plant.
+        True inner problems over the box per parameter at first; of a slow plant.
     same_start : float
-        Share of the box within which the start of a slow plant is left out, as it is near the
-        sequential hardware.
+        Of a slow plant the case's start is not evaluated if it is this close to the sequential
+        hardware, in shares of the box.
     rounds : int
         Rounds of surrogate, IPOPT and truth at most.
     settled, settled_slow : float
-        δ as a share of the bandwidth below which no further round is needed; of a slow plant.
+        The rounds end at a δ below this share of the bandwidth; of a slow plant.
     same_design : float
         Share of the box within which two designs are one.
-    cloud : int
-        Points in each box around the best θ.
-    boxes : tuple of float
-        Sizes of these boxes, as shares of the box of θ.
-    hardly : float
+    candidates : int
+        Points in each box around the best θ at which the expected improvement is evaluated.
+    box_sizes : tuple of float
+        Half widths of these boxes, as shares of the box of θ.
+    least_gain : float
         Gain in % of the bandwidth below which co-design is hardly worth it.
     """
 
@@ -192,22 +218,33 @@ class WorthOptions:
     settled: float = 1e-4
     settled_slow: float = 1.5e-3
     same_design: float = 1e-3
-    cloud: int = 256
-    boxes: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)
-    hardly: float = 1.0
+    candidates: int = 256
+    box_sizes: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)
+    least_gain: float = 1.0
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """The best design so far, and what the surrogate expects beyond it.
+    """The best design so far, and what the surrogate expects of better ones.
 
-    `left`: δ as bandwidth at equal hardware cost; `theta`: the next true design, the surrogate's
-    optimum with its bandwidth `predicted`, or that of the largest EI (NaN); `costs`, `values`: the
-    least and the largest f and v of designs within δ of the best. Bandwidths are in rad/s.
+    Attributes
+    ----------
+    best : InnerSample
+        Of the least J.
+    delta : float
+        δ, the gain that further rounds may bring, as bandwidth at equal hardware cost, rad/s:
+        twice the largest expected improvement, and the last error of prediction.
+    theta : array (n,)
+        The next true design: the surrogate's optimum, or where it has been evaluated already, the
+        point of the largest expected improvement.
+    predicted : float
+        Bandwidth that the surrogate predicts at its optimum, rad/s; NaN at the other kind of point.
+    costs, values : array (2,)
+        Least and largest f, and bandwidth in rad/s, of designs whose J is within δ of the best.
     """
 
     best: InnerSample
-    left: float
+    delta: float
     theta: Array
     predicted: float
     costs: Array
@@ -219,8 +256,10 @@ def worth(
 ) -> dict[str, Any]:
     """Estimate what co-design gains over the sequential design.
 
-    The sequential design is followed by rounds of surrogate and truth, until the next one is
-    expected to gain little. No clock ends them.
+    The sequential design and a Sobol set are evaluated first. Each round fits a surrogate and
+    evaluates the θ that it proposes, until δ is small. Then a multi-start search at both designs
+    checks their controllers, and the rounds resume where it finds a better one. No time limit ends
+    them.
 
     Parameters
     ----------
@@ -240,46 +279,49 @@ def worth(
     UserError
         Too few designs are certified to learn from, or none is feasible.
     """
-    began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
+    began, resonance = perf_counter(), HZ * case.baseline.first_resonance_hz
     lower, upper = box(sampler.problem)
-    looks = design("sobol", lower, upper, options.points * len(lower), seed)
-    spent = process_time()
-    first_resonance(sampler.problem, looks[0])  # the plant keeps it for the global check
-    slow = process_time() - spent > options.slow
+    sobol = design("sobol", lower, upper, options.points * len(lower), seed)
+    cpu_start = process_time()
+    first_resonance(sampler.problem, sobol[0])  # cached by the plant: it is evaluated below again
+    slow = process_time() - cpu_start > options.slow
     hardware = design_hardware(
-        sampler.problem, rule, starts=0 if slow else 8, seed=seed, workers=sampler.workers
+        sampler.problem, resonance, starts=0 if slow else 8, seed=seed, workers=sampler.workers
     )
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
-    apart = np.abs(np.subtract(hardware.theta, problem.start) / (upper - lower)).max()
-    first = (
-        [hardware.theta] if slow and apart < options.same_start else [hardware.theta, problem.start]
-    )
-    known = sampler.values(np.array(first), "first designs")
-    few = looks[: options.points_slow * len(lower)]
-    known += sampler.values(few if slow else looks, "global check")
-    missed, searched = 0.0, set[tuple[float, ...]]()
+    distance = np.abs(np.subtract(hardware.theta, problem.start) / (upper - lower)).max()
+    first = [hardware.theta]
+    if not (slow and distance < options.same_start):
+        first.append(problem.start)
+    samples = sampler.values(np.array(first), "first designs")
+    sobol = sobol[: options.points_slow * len(lower)] if slow else sobol
+    samples += sampler.values(sobol, "global check")
+    tolerance = options.settled_slow if slow else options.settled
+    prediction_error, searched = 0.0, set[tuple[float, ...]]()
     for rounds_left in reversed(range(options.rounds + 1)):
-        known = sampler.latest(known)
-        ahead = outlook(problem, known, missed, seed, options=options)
-        share = options.settled_slow if slow else options.settled
-        settled = ahead.left <= share * ahead.best.bandwidth
+        samples = sampler.latest(samples)  # searches improve the controllers of earlier ones
+        ahead = outlook(problem, samples, prediction_error, seed, options=options)
+        settled = ahead.delta <= tolerance * ahead.best.bandwidth
         if settled or not rounds_left:
-            ends = {end.theta: end for end in (known[0], ahead.best) if end.kappa}
-            found = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
-            better = [at for at in found if found[at].feasible and found[at].value > ends[at].value]
+            ends = {end.theta: end for end in (samples[0], ahead.best) if end.kappa}
+            new = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
+            better = [at for at in new if new[at].feasible and new[at].value > ends[at].value]
             for at in better:
-                sampler.value_from(at, found[at].design.kappa.tolist())
+                sampler.value_from(at, new[at].design.kappa.tolist())
             if not (better and rounds_left):
-                if unsure := search_error(sampler, ahead.best):
-                    ahead = outlook(problem, known, missed + unsure, seed, options=options)
+                if error := search_error(sampler, ahead.best):
+                    ahead = outlook(
+                        problem, samples, prediction_error + error, seed, options=options
+                    )
                 break
-            missed, searched = 0.0, searched | ends.keys()
+            prediction_error, searched = 0.0, searched | ends.keys()
             continue
-        known += sampler.values(ahead.theta, "the best expected")
-        missed = float(np.fmax(0.0, abs(known[-1].value - ahead.predicted)))
-    if not np.isfinite(objective_of(problem, ahead.best)):
-        raise UserError(f"no feasible design was found: {known[0].shortfall}")
+        samples += sampler.values(ahead.theta, "the best expected")
+        prediction_error = float(np.fmax(0.0, abs(samples[-1].value - ahead.predicted)))
+    sequential, best = samples[0], ahead.best
+    if not np.isfinite(objective_of(problem, best)):
+        raise UserError(f"no feasible design was found: {sequential.shortfall}")
     entries: list[dict[str, Any]] = [
         {
             "theta": dict(zip(problem.names, sample.theta, strict=True)),
@@ -288,23 +330,23 @@ def worth(
             "cost_unit": problem.cost_unit,
             "bandwidth_hz": sample.bandwidth / HZ,
         }
-        for sample in (known[0], ahead.best)
+        for sample in (sequential, best)
     ]
     baseline = baseline_of(sampler.problem)
-    for entry, sample in zip(entries, (known[0], ahead.best), strict=True):
+    for entry, sample in zip(entries, (sequential, best), strict=True):
         if sample.feasible:
-            own = baseline.design_of(sample)
-            entry["survives"] = baseline.judged(sample.theta, own, sampler.workers)[1].entry
-    old, bandwidth = entries[0]["hardware_cost"], known[0].bandwidth
-    gain = objective(problem, known[0].theta, bandwidth) - objective_of(problem, ahead.best)
+            controller = baseline.design_of(sample)
+            entry["survives"] = baseline.judged(sample.theta, controller, sampler.workers)[1].entry
+    cost, bandwidth = entries[0]["hardware_cost"], sequential.bandwidth
+    gain = objective(problem, sequential.theta, bandwidth) - objective_of(problem, best)
     return {
         "sequential": entries[0],
         "co_design": entries[1],
-        "hardware_cost_percent": 100.0 * (entries[1]["hardware_cost"] / old - 1.0),
-        "bandwidth_percent": 100.0 * (ahead.best.bandwidth / bandwidth - 1.0),
+        "hardware_cost_percent": 100.0 * (entries[1]["hardware_cost"] / cost - 1.0),
+        "bandwidth_percent": 100.0 * (best.bandwidth / bandwidth - 1.0),
         "gain_percent": 100.0 * gain / abs(problem.w2) / bandwidth,  # at equal hardware cost
-        "uncertainty_percent": 100.0 * ahead.left / bandwidth,
-        "full_solve_hardware_cost_percent": (100.0 * (ahead.costs / old - 1.0)).tolist(),
+        "uncertainty_percent": 100.0 * ahead.delta / bandwidth,
+        "full_solve_hardware_cost_percent": (100.0 * (ahead.costs / cost - 1.0)).tolist(),
         "full_solve_bandwidth_percent": (100.0 * (ahead.values / bandwidth - 1.0)).tolist(),
         "first_resonance_hz": hardware.first_resonance / HZ,
         "resonance_met": hardware.met,
@@ -316,71 +358,90 @@ def worth(
 
 def outlook(
     problem: CoDesignProblem,
-    known: list[InnerSample],
-    missed: float,
+    samples: list[InnerSample],
+    prediction_error: float,
     seed: int,
     *,
     options: WorthOptions = WorthOptions(),
 ) -> Outlook:
-    """By the surrogate of all that is known, which `missed` the last true design (rad/s)."""
-    learnt = [each for each in known if each.feasible]
-    if len(learnt) <= len(problem.names):
-        raise UserError(f"only {len(learnt)} of {len(known)} designs certified; widen the bounds")
-    best = min(known, key=lambda sample: objective_of(problem, sample))
-    process = fit_bandwidth(problem, learnt, seed, gradients=True)
+    """The next true design by a Gaussian process m(θ) ± s(θ) of the bandwidth, and δ.
+
+    With Δ = J_best - (w₁ f + w₂ m) and σ = |w₂| s, the expected improvement of J at θ is
+
+        EI = Δ Φ(Δ/σ) + σ φ(Δ/σ),   δ = 2 max EI/|w₂| + prediction error,
+
+    over candidates in boxes around the best θ that meet λ <= 0 and are not evaluated yet.
+
+    Parameters
+    ----------
+    samples : list of InnerSample
+        All true designs.
+    prediction_error : float
+        |truth - prediction| of the last true design, rad/s.
+    """
+    certified = [sample for sample in samples if sample.feasible]
+    if len(certified) <= len(problem.names):
+        raise UserError(
+            f"only {len(certified)} of {len(samples)} designs certified; widen the bounds"
+        )
+    best = min(samples, key=lambda sample: objective_of(problem, sample))
+    process = fit_bandwidth(problem, certified, seed, gradients=True)
     lower, upper = box(problem)
     program = outer_program(problem, to_casadi(process, std=False))
     starts = np.vstack([best.theta, design("sobol", lower, upper, 8, seed)])
     try:
-        expected = solve_program(program, starts).best.x
-    except OuterFailure:  # the surrogate expects a feasible design nowhere
-        expected = np.array(best.theta)
-    spread = design("sobol", lower - upper, upper - lower, options.cloud, seed)
-    cloud = best.theta + np.vstack([reach * spread for reach in options.boxes])
-    cloud = np.clip(np.vstack([expected, best.theta, cloud]), lower, upper)
-    costs, constraints = (np.array(value) for value in plant_of(problem).hardware(cloud.T))
+        optimum = solve_program(program, starts).best.x
+    except OuterFailure:  # the surrogate predicts a feasible design nowhere
+        optimum = np.array(best.theta)
+    offsets = design("sobol", lower - upper, upper - lower, options.candidates, seed)
+    thetas = best.theta + np.vstack([size * offsets for size in options.box_sizes])
+    thetas = np.clip(np.vstack([optimum, best.theta, thetas]), lower, upper)  # (k, n)
+    costs, constraints = (np.array(value) for value in plant_of(problem).hardware(thetas.T))
     met = ConstraintOptions.met * constraint_sizes(problem)[:, None]
     allowed = (constraints <= met).all(axis=0)
-    steps = (cloud[:, None] - [each.theta for each in known]) / (upper - lower)
-    new = np.abs(steps).max(axis=2).min(axis=1) > options.same_design
-    mean, deviation = process.predict(cloud, return_std=True)
+    distances = np.abs((thetas[:, None] - [each.theta for each in samples]) / (upper - lower))
+    new = distances.max(axis=2).min(axis=1) > options.same_design
+    mean, deviation = process.predict(thetas, return_std=True)
     J = problem.w1 * costs[0] + problem.w2 * mean
-    s, gap = abs(problem.w2) * deviation, objective_of(problem, best) - J
-    z = gap / s
-    gains = gap * ndtr(z) + s * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-    gains = np.where(allowed & new, np.fmax(gains, 0.0), 0.0)  # f may be NaN at a θ
-    left = 2.0 * float(gains.max()) / abs(problem.w2) + missed
-    as_good = allowed & (gap >= -left * abs(problem.w2))
-    as_good[1] = True  # the best itself
-    ends = [np.quantile(each[as_good], (0.0, 1.0)) for each in (costs[0], mean)]
-    ends[1] += (-left, left)
+    sigma, improvement = abs(problem.w2) * deviation, objective_of(problem, best) - J
+    z = improvement / sigma
+    EI = improvement * ndtr(z) + sigma * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+    EI = np.where(allowed & new, np.fmax(EI, 0.0), 0.0)  # f may be NaN at a θ
+    delta = 2.0 * float(EI.max()) / abs(problem.w2) + prediction_error
+    within_delta = allowed & (improvement >= -delta * abs(problem.w2))
+    within_delta[1] = True  # the best itself
+    ranges = [np.quantile(each[within_delta], (0.0, 1.0)) for each in (costs[0], mean)]
+    ranges[1] += (-delta, delta)
     if new[0]:
-        return Outlook(best, left, expected, float(mean[0]), *ends)
-    return Outlook(best, left, cloud[gains.argmax()], np.nan, *ends)
+        return Outlook(best, delta, optimum, float(mean[0]), *ranges)
+    return Outlook(best, delta, thetas[EI.argmax()], np.nan, *ranges)
 
 
 def search_error(sampler: Sampler, best: InnerSample) -> float:
-    """By how much a full solve may end with another bandwidth at this θ (rad/s): by what the worst
-    plants found in the box cost, and, where one search alone found the best controller, by the
-    distance to the next local optimum."""
+    """By how much a full solve may end with another bandwidth at the same θ (rad/s).
+
+    The loss to the worst plants found in the box, and, where only one start of the multi-start
+    search reached the best controller, its distance to the next local optimum: a better optimum may
+    be missed as easily.
+    """
     if not best.kappa:
         return 0.0
-    ends = multistart_at(sampler, best).design.local_optima[:2]
-    alone = len(ends) == 2 and ends[0].count == 1
-    apart = ends[0].bandwidth - ends[1].bandwidth if alone else 0.0
+    optima = multistart_at(sampler, best).design.local_optima[:2]
+    only_one_start = len(optima) == 2 and optima[0].count == 1
+    error = optima[0].bandwidth - optima[1].bandwidth if only_one_start else 0.0
     design = value_with_design(sampler, best).design
     if plants := DesignOnBox(sampler.problem, best.theta, design).worst()[1]:
-        wider = with_scenarios(sampler, plants).value_from(best.theta, best.kappa)
-        apart += best.value - float(np.nan_to_num(wider.value))
-    return apart
+        robust = with_scenarios(sampler, plants).value_from(best.theta, best.kappa)
+        error += best.value - float(np.nan_to_num(robust.value))
+    return error
 
 
-def worth_words(found: Mapping[str, Any], *, options: WorthOptions = WorthOptions()) -> list[str]:
+def worth_words(result: Mapping[str, Any], *, options: WorthOptions = WorthOptions()) -> list[str]:
     """Write the decision, what a full solve may add, both designs and their cost.
 
     Parameters
     ----------
-    found : mapping
+    result : mapping
         The content of worth.json.
     options : WorthOptions
 
@@ -390,30 +451,32 @@ def worth_words(found: Mapping[str, Any], *, options: WorthOptions = WorthOption
         Lines; the decision first.
     """
     lines = ["answer        Co-design is needed: the sequential hardware has no controller."]
-    if np.isfinite(found["bandwidth_percent"]):
-        hardly = found["gain_percent"] + found["uncertainty_percent"] < options.hardly
+    if np.isfinite(result["bandwidth_percent"]):
+        negligible = result["gain_percent"] + result["uncertainty_percent"] < options.least_gain
         cost, bandwidth = (
-            " to ".join(dict.fromkeys(f"{v:+z.1f}" for v in found[f"full_solve_{key}_percent"]))
+            " to ".join(dict.fromkeys(f"{v:+z.1f}" for v in result[f"full_solve_{key}_percent"]))
             for key in ("hardware_cost", "bandwidth")
         )
-        weak = found["co_design"].get("survives", {"state": State.UNKNOWN, "words": "not known"})
-        answer = f"Co-design is {'hardly ' * hardly}worth it"
-        if weak["state"] != State.PASSED:
-            answer += f", but its design is not to be built as it is (survives {weak['state']})"
-        settled = "" if found["settled"] else f"; {options.rounds} rounds did not settle it"
+        survives = result["co_design"].get(
+            "survives", {"state": State.UNKNOWN, "words": "not known"}
+        )
+        answer = f"Co-design is {'hardly ' * negligible}worth it"
+        if survives["state"] != State.PASSED:
+            answer += f", but its design is not to be built as it is (survives {survives['state']})"
+        unsettled = "" if result["settled"] else f"; {options.rounds} rounds did not settle it"
         lines = [
             f"answer        {answer}: "
-            f"hardware cost {found['hardware_cost_percent']:+z.1f} %, "
-            f"bandwidth {found['bandwidth_percent']:+z.1f} % "
+            f"hardware cost {result['hardware_cost_percent']:+z.1f} %, "
+            f"bandwidth {result['bandwidth_percent']:+z.1f} % "
             "against the sequential design. Both designs are certified.",
             f"full solve    hardware cost {cost} %, bandwidth {bandwidth} % expected: an estimate, "
-            f"no bound{settled}",
+            f"no bound{unsettled}",
         ]
-    for label, each in (("sequential", found["sequential"]), ("co-design", found["co_design"])):
+    for label, each in (("sequential", result["sequential"]), ("co-design", result["co_design"])):
         hz = f"{number(each['bandwidth_hz'])} Hz"
         lines.append(f"{label:14s}{theta_words(each)}: {cost_words(each)}, {hz}")
         if line := each.get("survives"):
             lines.append(f"              survives {line['state']}: {line['words']}")
-    met = "met" if found["resonance_met"] else "not met anywhere in the box"
-    rule = f"first resonance {number(found['first_resonance_hz'], 4)} Hz, the rule is {met}"
-    return [*lines, f"hardware      {rule}", f"cost          {found['syntheses']} syntheses"]
+    met = "met" if result["resonance_met"] else "not met anywhere in the box"
+    rule = f"first resonance {number(result['first_resonance_hz'], 4)} Hz, the rule is {met}"
+    return [*lines, f"hardware      {rule}", f"cost          {result['syntheses']} syntheses"]

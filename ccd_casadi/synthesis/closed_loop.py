@@ -36,7 +36,7 @@ class ClassicalMargins:
         Least change of phase, either way, at |L| = 1, and least lag there in s; inf where |L| does
         not cross 1.
     crossover : float
-        Where |L| falls through 1 for good, rad/s (`_crossover`); inf as well.
+        Where |L| falls through 1, above it below and below it above over most of ln ω, rad/s; inf.
     places : tuple of float
         Where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
     """

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import inspect
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
     assert (inner.S_max, inner.S_low, inner.omega_low_hz) == (1.75, 0.03, 1.0)
     assert (inner.omega_S_hz, inner.omega_T_hz) == ((10.0, 1800.0), (25.0, 1000.0))
     assert (inner.gamma_backoff, inner.sweep_points) == (1.02, (20, 20))
-    suspension = {"frequency_hz": 0.1, "damping_ratio": 0.7, "rigid_modes": None}
+    suspension = {"frequency_hz": None, "damping_ratio": 0.7, "rigid_modes": None}
     assert vars(case.suspension) == suspension
     assert (case.sampling.design, case.sampling.points) == ("grid", 5)
     assert (case.outer.starts, case.outer.tolerance, case.outer.max_refinements) == (16, 1e-3, 12)
@@ -76,6 +77,20 @@ def test_the_problem_is_in_si() -> None:
     assert problem.weights.omega_K == pytest.approx(100.0 * hz, rel=1e-15)
     assert problem.suspension.frequency_hz == 0.1
     assert problem.source.options == (("zeta", 0.01),)
+
+
+@pytest.mark.parametrize(
+    ("low", "given", "expected"),
+    [(1.0, None, 0.1), (5.0, None, 0.1), (0.02, None, 0.002), (0.02, 0.05, 0.05)],
+)
+def test_a_suspension_is_a_decade_below_the_loop(low: float, given: Any, expected: float) -> None:
+    """At 0.1 Hz a loop of 0.13 Hz on free bodies was "not stable", and infeasible for that."""
+    case = load_case(TWO_MASS)
+    case = replace(
+        case, inner=replace(case.inner, omega_low_hz=low),
+        suspension=replace(case.suspension, frequency_hz=given),
+    )  # fmt: skip
+    assert problem_of(case).suspension.frequency_hz == pytest.approx(expected, rel=1e-15)
 
 
 def test_left_out_keys_take_their_defaults() -> None:

@@ -68,8 +68,8 @@ def test_a_round_is_expected_to_gain_less_the_more_true_designs_there_are(tmp_pa
             last = outlook(problem, known, missed, seed)
         gained = objective_of(problem, first.best) - objective_of(problem, last.best)
     assert gained > 0.0
-    assert abs(problem.w2) * first.left >= gained
-    assert last.left < 1e-2 * first.left
+    assert abs(problem.w2) * first.delta >= gained
+    assert last.delta < 1e-2 * first.delta
     assert last.costs[0] <= hardware_cost(plant_of(problem), last.best.theta) <= last.costs[1]
 
 

@@ -35,6 +35,8 @@ from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis import derivatives, synthesis
 
 KINDS = kinds()
+HEAVY = ("disturbance", "error")  # whose figures and slopes have tests of their own elsewhere
+EACH = [pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name for name in KINDS]
 SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design"),
     (structured_bandwidth, "synthesise_sections"), (structured_bandwidth, "least_value"),
@@ -81,7 +83,7 @@ def counted(calls: Counter[str], name: str, honest: Any) -> Any:
     return call
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=EACH)
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A solve and the same once more from its store, every synthesis counted."""
     case, store = KINDS[request.param], tmp_path_factory.mktemp("kind") / "samples.sqlite"
@@ -179,7 +181,7 @@ def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
                 jsonschema.validate(other, schema)
 
 
-@pytest.mark.parametrize("name", list(KINDS))
+@pytest.mark.parametrize("name", EACH)
 def test_what_is_infeasible_has_a_result_too(name: str, schema: dict[str, Any]) -> None:
     case = KINDS[name]
     result = solve(replace(case, inner=replace(case.inner, S_low=1e-6)), Direct(starts=1)).result

@@ -54,6 +54,8 @@ def test_every_file_that_it_imports_or_names_counts(folder: Path) -> None:
     (folder / "data").mkdir()
     (folder / "data/table.csv").write_text("1")
     assert folder / "data/table.csv" in files_of(folder / "plant.py", ["data"])
+    (folder / "data/samples.sqlite").touch()  # the folder of a run, written meanwhile
+    assert folder / "data/table.csv" not in files_of(folder / "plant.py", ["data"])
 
 
 @pytest.mark.parametrize("name", ["plant.py", "helper_of_plant.py", "parts_of_plant/masses.py",

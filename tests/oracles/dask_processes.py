@@ -114,4 +114,4 @@ def _command_line(pid: int) -> bytes:
 
 def both_workers(cluster: Cluster) -> None:
     cluster._client.wait_for_workers(2, timeout=60)
-    cluster._survey()
+    cluster._count_workers()

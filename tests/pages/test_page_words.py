@@ -28,7 +28,7 @@ from ccd_casadi.reporting.gain_figures import above
 from ccd_casadi.reporting.insight_page import front_answer
 from ccd_casadi.reporting.landscape import history_blocks
 from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
-from ccd_casadi.reporting.nyquist import near, nyquist_panel
+from ccd_casadi.reporting.nyquist import drawable, nyquist_panel
 from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.run_verdict import LINES, advice, head_of, run_head
 from ccd_casadi.studies.comparison import conclusions
@@ -261,7 +261,7 @@ def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
 
 
 def test_what_a_nyquist_plot_leaves_out_has_no_half_of_a_point() -> None:
-    found = near(np.array([1.0 + 2.0j, 1e4 - 3.0j, -0.5j, np.inf]))
+    found = drawable(np.array([1.0 + 2.0j, 1e4 - 3.0j, -0.5j, np.inf]))
     np.testing.assert_array_equal(np.isnan(found.real), np.isnan(found.imag))
     np.testing.assert_array_equal(np.isnan(found.real), [False, True, False, True])
 

@@ -169,7 +169,8 @@ def test_gradient_of_the_bound_at_a_sharp_transmission_zero() -> None:
 
     found, spread = best_difference(moved)
     assert spread[0] < 1e-6 * abs(found[0])
-    assert elasticities(design, theta)[3, 1] == pytest.approx(found[0], rel=ACCURACY)
+    known = max(ACCURACY * abs(found[0]), spread[0])  # what rounding leaves of the difference
+    assert elasticities(design, theta)[3, 1] == pytest.approx(found[0], abs=known)
 
 
 # Elasticities of an ill-conditioned plant's figures to c_K and ω_K in arithmetic of 130 digits: the
