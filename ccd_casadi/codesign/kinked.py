@@ -24,7 +24,7 @@ from ccd_casadi.codesign.lifted_kkt import (
 )
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
-from ccd_casadi.optim.kkt import damped_bfgs
+from ccd_casadi.optim.quadratic_programmes import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, Step, TrustRegionModel, minimise
 from ccd_casadi.support.arrays import Array
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
-from ccd_casadi.optim.kkt import non_negative, symmetric_rank_one
+from ccd_casadi.optim.kkt import non_negative
+from ccd_casadi.optim.quadratic_programmes import symmetric_rank_one
 from ccd_casadi.optim.trust_region import (
     Data,
     Iterate,

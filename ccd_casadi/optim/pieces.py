@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ccd_casadi.optim.kkt import damped_bfgs
+from ccd_casadi.optim.quadratic_programmes import damped_bfgs
 from ccd_casadi.optim.trust_region import (
     Iterate,
     Radius,

@@ -21,7 +21,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ccd_casadi.optim.kkt import convex, solve_elastic
+from ccd_casadi.optim.quadratic_programmes import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
 Data = TypeVar("Data")

@@ -23,6 +23,7 @@ from ccd_casadi.reporting.run_verdict import advice
 from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.studies.sequential_hardware import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.studies.steepest_descent import (
     AnyDesign,
     Descent,
@@ -30,7 +31,6 @@ from ccd_casadi.studies.steepest_descent import (
     baseline_of,
     steepest_descent,
 )
-from ccd_casadi.studies.worth_estimate import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress

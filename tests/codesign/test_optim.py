@@ -11,9 +11,9 @@ from test_kinks import pieces
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.inner_problem.objective import TrueQuantities
-from ccd_casadi.optim import kkt
 from ccd_casadi.optim import pieces as of_pieces
-from ccd_casadi.optim.kkt import QuadraticOptions, solve_elastic, solve_quadratic
+from ccd_casadi.optim import quadratic_programmes
+from ccd_casadi.optim.quadratic_programmes import QuadraticOptions, solve_elastic, solve_quadratic
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -91,7 +91,7 @@ def failing(monkeypatch: pytest.MonkeyPatch):
 
     def let(count: int) -> None:
         left = [count]
-        dual, interior = kkt.daqp.solve, kkt._interior
+        dual, interior = quadratic_programmes.daqp.solve, quadratic_programmes._interior
 
         def solve(*programme: object, **options: object) -> tuple:
             x, value, flag, info = dual(*programme, **options)
@@ -102,8 +102,8 @@ def failing(monkeypatch: pytest.MonkeyPatch):
             left[0] -= refused
             return Refused() if refused else interior(*shape)
 
-        monkeypatch.setattr(kkt.daqp, "solve", solve)
-        monkeypatch.setattr(kkt, "_interior", other)
+        monkeypatch.setattr(quadratic_programmes.daqp, "solve", solve)
+        monkeypatch.setattr(quadratic_programmes, "_interior", other)
 
     return let
 

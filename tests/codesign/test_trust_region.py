@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
-from ccd_casadi.optim.kkt import QuadraticOptions, damped_bfgs, symmetric_rank_one
+from ccd_casadi.optim.quadratic_programmes import QuadraticOptions, damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import (
     Iterate,
     Minimum,

@@ -13,7 +13,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.robust_check import check_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
-from ccd_casadi.studies.worth_estimate import design_hardware, first_resonance
+from ccd_casadi.studies.sequential_hardware import design_hardware, first_resonance
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 
 HZ = 2.0 * np.pi
