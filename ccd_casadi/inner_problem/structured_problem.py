@@ -169,7 +169,10 @@ class StructuredProblem(ControllerProblem):
                 raise PlantError(f"has channels 1 to {p} {words}")
 
     def with_warm_start(self, kappa: tuple[float, ...], most: int) -> Self:
-        """With one more warm start of what it minimises, first, `most` at most."""
+        """With one more warm start of what it minimises, first, `most` at most; as it is by the κ
+        of a design that has no controller."""
+        if not kappa:
+            return self
         name = "warm_starts" if self.figure is BANDWIDTH else "error_warm_starts"
         others = (known for known in getattr(self, name) if known != kappa)
         return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]

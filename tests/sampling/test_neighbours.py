@@ -99,3 +99,10 @@ def test_a_controller_given_for_a_theta_counts_where_it_is_better(
         good = sampler.value_from(theta, GOOD)
     assert (poor.kappa, good.kappa) == (POOR, GOOD)
     assert sampler.latest([poor]) == [good]
+
+
+def test_a_design_without_a_controller_is_no_warm_start() -> None:
+    """A search at its θ begins from others': an empty κ had ended a run in a traceback."""
+    known = StructuredProblem(warm_starts=(POOR,))
+    assert known.with_warm_start((), 3) == known
+    assert known.with_warm_start(GOOD, 3).warm_starts == (GOOD, POOR)
