@@ -50,6 +50,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.worker_process import alongside
@@ -152,6 +153,12 @@ class StructuredOuter(ThetaOuter):
                     sampler, theta, self.ended or attempt > 0, options
                 )
             problem, found = sampler.problem, value_with_design(sampler, best)
+            if found.design.controller is None:  # its own controller leads to none: from others
+                found = multistart_at(sampler, best)
+            if found.design.controller is None:
+                at = dict(zip(problem.names, best.theta, strict=True))
+                words = f"no controller was found again at {at}: {found.design.words}"
+                raise UserError(f"{words}; give more controller.starts, or another --seed")
             worst, scenarios = _worst_plants(sampler, best, found.design, options)
             multistart = None if scenarios else multistart_at(sampler, best)
             gap = np.nan if multistart is None else _gap(problem, best, multistart)

@@ -289,6 +289,14 @@ def structured_value(
     if initial:
         made = here.searched(initial, workers=workers)
         spent += 1
+    if problem.figure is not BANDWIDTH and not (made and made.certified):
+        # Controllers of least error meet every bound where those of most bandwidth may not.
+        structured = structured_of(problem)
+        started = with_structured(problem, warm_starts=structured.error_warm_starts)
+        others = warm_starts_at(started, structure_of(problem), here.plants, bounds_of(problem))
+        if others:
+            made = here.searched(others, workers=workers)
+            spent += 1
     if made is None or (starts and not made.certified):
         made = here.searched(initial, min(options.starts, starts), workers=workers)
         spent += 1
