@@ -125,7 +125,7 @@ class Move:
         """Its first part."""
         kept = self.time <= seconds
         cut = {name: getattr(self, name)[kept]
-               for name in ("time", "position", "acceleration", "error", "force")}  # fmt: skip
+               for name in ("time", "position", "error", "force")}  # fmt: skip
         return replace(self, **cut)
 
     @property
