@@ -22,7 +22,7 @@ SOURCES = {
     "nano stage": ("WataruOhnishi/control_benchmark@ea728a2, P4th, P8th", "MIT, numbers only",
                    "benchmarks/stage_judge.py"),
     "guided beam": ("aatmdelissen/controller-topology-optimization@36002cd", "MIT, formula only",
-                    "benchmarks/guided_beam.py"),
+                    "benchmarks/oracle.py guided_beam"),
 }  # fmt: skip
 
 
