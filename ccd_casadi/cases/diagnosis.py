@@ -138,7 +138,7 @@ def diagnose(
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"
                 findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
                 continue
-            found = facts_of(modal, scaled)
+            found = facts_of(theta, modal, scaled)
             doubt = plant.doubt(theta) if index < options.with_derivatives else ""
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)

@@ -59,6 +59,8 @@ class PlantFacts:
 
     Attributes
     ----------
+    theta : tuple of float (n,)
+        With what varies, SI.
     modes : tuple of PlantMode
     zeros : tuple of Zero
     effort_hz : float
@@ -68,17 +70,19 @@ class PlantFacts:
         infinite where it moves nothing freely.
     """
 
+    theta: tuple[float, ...]
     modes: tuple[PlantMode, ...]
     zeros: tuple[Zero, ...]
     effort_hz: float
     inertia: float = float("inf")
 
 
-def facts_of(modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
+def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
     """Collect the facts of a plant at one θ.
 
     Parameters
     ----------
+    theta : tuple of float (n,)
     modal : ModalPlant
     scaled : ScaledPlant
         The same plant.
@@ -90,7 +94,7 @@ def facts_of(modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
     effort = _effort_hz(modal, scaled)
     driven = float((modal.B[modal.rigid] ** 2).sum(axis=0).max(initial=0.0))
     inertia = 1.0 / driven if driven > 0.0 else float("inf")
-    return PlantFacts(modes_of(modal), _zeros(scaled, effort), effort, inertia)
+    return PlantFacts(theta, modes_of(modal), _zeros(scaled, effort), effort, inertia)
 
 
 def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
