@@ -133,6 +133,16 @@ class Deployment:
         return tuple(words)
 
     @property
+    def levels(self) -> tuple[str, ...]:
+        """The weighted functions that exceed `weighted_level` by more than `excess` in the code."""
+        figures = {} if self.judge is None else self.judge.figures
+        return tuple(
+            f"|W_{name} {name}| of the code is {figures[name]:.3g} times weighted_level"
+            for name in ("KS", "T")
+            if figures.get(name, 0.0) > 1.0 + self.target.excess
+        )
+
+    @property
     def passed(self) -> bool:
         """Whether every sampled loop of a verified run keeps its target."""
         return not self.shortfalls and not self.unverified
@@ -220,7 +230,7 @@ def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
         if worst.figures is not K:
             where = place_words(worst.at)
             kept += f"; on the plant with the largest peak ({where}) {_loop_words(worst.figures)}"
-    reason = reason_words(run, found)
+    reason = "; ".join(filter(None, (reason_words(run, found), *found.levels)))
     if reason:
         return VerdictLine(State.WARNED, f"{kept}; {reason}", figures)
     return VerdictLine(State.PASSED, kept, figures)

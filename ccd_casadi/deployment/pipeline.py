@@ -37,6 +37,7 @@ from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
@@ -46,7 +47,7 @@ from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.statics import compliance_of, statics
 
@@ -236,20 +237,34 @@ def deploy(
 
 
 def _judged(run: FinishedRun, found: Deployment) -> Judgement:
-    """The coefficients of the code on the plants as their function returned them."""
+    """The coefficients of the code on the plants as their function returned them.
+
+    W_KS KS and W_T T of the code are figures of it: a bound of theirs is one of the design.
+    """
     target, most, period = found.target, found.compliance_max, 1.0 / found.rate_hz
     parts = [discretise(one.chosen.controller, found.conversion, period, found.delay)
              for one in found.orders]  # fmt: skip
     K = replace(assemble([one.channel for one in found.orders], parts), period=period)
+    inner, wider = run.problem.inner, 1.0 + target.excess
     bounds = Bounds(
-        target.peak, target.peak, run.problem.inner.omega_low,
-        compliance_max=None if most is None else most * (1.0 + target.excess),
+        target.peak, inner.S_low * wider, inner.omega_low,
+        compliance_max=None if most is None else most * wider,
     )  # fmt: skip
-    return judge_loops(
-        as_written(run), K, found.realisation.as_coded, bounds,
-        Sampling(found.rate_hz, 1e6 * found.delay), target.bandwidth * (1.0 - target.tolerance),
-        integrator=False, on_all=False,
+    plants, sampling = as_written(run), Sampling(found.rate_hz, 1e6 * found.delay)
+    judged = judge_loops(
+        plants, K, found.realisation.as_coded, bounds, sampling,
+        target.bandwidth * (1.0 - target.tolerance), integrator=False, on_all=False,
     )  # fmt: skip
+    if not judged.passed:
+        return judged
+    kept = ["S_max", "S_low", *(["compliance_max"] if most is not None else [])]
+    words = f"stable and within {', '.join(kept)} on {counted(len(plants), 'plant')}"
+    figures = dict(judged.figures)
+    if kind_of(run.problem).as_designed and bounds_of(run.problem).weighted_level is not None:
+        own = replace(bounds_of(run.problem), channels=())
+        worst = certify(plants, K, own, sampling, integrator=False).worst
+        figures |= {name: worst[name] for name in ("KS", "T")}
+    return replace(judged, figures=figures, words=words)
 
 
 def _orders(

@@ -15,9 +15,10 @@ from oracles.case_documents import TWO_MASS
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.deploy_files import deployment_dict
-from ccd_casadi.deployment.outcome import Deployment
+from ccd_casadi.deployment.outcome import Deployment, deployed_line
 from ccd_casadi.deployment.pipeline import _judged, deploy
 from ccd_casadi.deployment.robust_set import as_written, members
 from ccd_casadi.deployment.timing import Timing
@@ -154,7 +155,22 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
     assert found.judge.plants > 4
     worst = found.judge.figures["S_max"] * found.target.peak
     assert worst == pytest.approx(found.worst.figures.sensitivity_peak, rel=1e-5)
-    K = found.realisation.system
+    K, T = found.realisation.system, 1.0 / 8000.0
+    z, k = np.exp(1j * HZ * T), K.response(np.array([HZ]))[0]
+    at_low = 0.0
+    for plant in as_written(run):  # |S(ω_low)| over S_low by the exact hold and delay
+        G = sampled(plant, T, 60e-6)
+        g = G.C @ np.linalg.solve(z * np.eye(len(G.A)) - G.A, G.B) + G.D
+        at_low = max(at_low, np.linalg.norm(np.linalg.inv(np.eye(2) + g @ k), 2))
+    S_low = run.problem.inner.S_low * (1.0 + found.target.excess)
+    assert found.judge.figures["S_low"] == pytest.approx(at_low / S_low, rel=1e-6)
+    largest = 12.0 * max(found.judge.figures["KS"], found.judge.figures["T"])
+    for share, state in ((1.01, State.PASSED), (0.3, State.WARNED)):
+        other = replace(run.problem.controller, weighted_level=share * largest)
+        of_other = replace(run, problem=replace(run.problem, controller=other))
+        again = replace(found, judge=_judged(of_other, found))
+        assert deployed_line(run, again).state == state, again.levels
+        assert any("3.33 times weighted_level" in words for words in again.levels) == (share < 1.0)
     wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))
     assert _judged(run, replace(found, realisation=wrong)).passed is False
     for share, passed in ((1.001, True), (0.999, False)):
