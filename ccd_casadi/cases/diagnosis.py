@@ -139,7 +139,11 @@ def diagnose(
                 findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
                 continue
             found = facts_of(theta, modal, scaled)
-            doubt = plant.doubt(theta) if index < options.with_derivatives else ""
+            doubt = (
+                plant.mismatch(theta) or plant.doubt(theta)
+                if index < options.with_derivatives
+                else ""
+            )
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
             here += [

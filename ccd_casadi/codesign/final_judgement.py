@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.fixed_structure import SectionsDesign, certify
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, require_as_returned
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
@@ -44,6 +44,7 @@ def written_plants(
     list of StateSpace
         The model first; SI, u in and y out.
     """
+    require_as_returned(problem, theta)
     system, robust = mechanics(plant_of(problem), theta, derivatives=False), problem.robust
     places = () if robust is None else robust.perturbations(shifts)
     others = [off for off in places if off != NOMINAL]

@@ -16,6 +16,7 @@ from ccd_casadi.deployment.realisation import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import require_as_returned
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -111,6 +112,7 @@ def as_written(run: FinishedRun) -> list[StateSpace]:
     them."""
     if not kind_of(run.problem).as_designed:
         return written_plants(run.problem, run.theta, RobustCheckOptions().shifts)
+    require_as_returned(run.problem, run.theta)
     uncertain = uncertain_plant(run.problem, run.theta)
     return uncertain.as_written([(0, uncertain.nominal), *_points(run, uncertain, True)])
 

@@ -30,9 +30,9 @@ from ccd_casadi.plants.modal import (
     require_damping,
     without_hidden_rigid_modes,
 )
-from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
+from ccd_casadi.plants.plant import Mechanics, Plant, mechanics, named_values
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.support.text import use_units
 from ccd_casadi.support.worker_process import one_blas_thread
@@ -179,6 +179,24 @@ def plant_of(problem: CoDesignProblem) -> Plant:
     """
     use_units(*problem.spoken)
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
+
+
+def require_as_returned(problem: CoDesignProblem, theta: Sequence[float]) -> None:
+    """Check that what is judged at θ are the matrices that a person's function returns there.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float (n_θ,)
+        θ in SI.
+
+    Raises
+    ------
+    PlantError
+        They differ: the function takes another branch of numbers than of symbols.
+    """
+    if words := plant_of(problem).mismatch(theta):
+        at = named_values(problem.names, theta)
+        raise PlantError(f"the plant function at {at}: {words}; let no branch hang on float(theta)")
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:

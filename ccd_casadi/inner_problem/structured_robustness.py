@@ -24,7 +24,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
     worst_plants,
 )
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, require_as_returned
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
     StructuredValueOptions,
@@ -150,6 +150,7 @@ class DesignOnBox:
             points += [(option, np.array(point)) for option, point in structured.scenarios]
         K = self.design.controller
         assert K is not None
+        require_as_returned(self.problem, self.theta)
         plants, loose = uncertain.as_written(points), self.options.looseness
         return _judged(self.problem, plants, K, loose, workers), len(points)
 

@@ -3,7 +3,8 @@
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from itertools import islice, product
 from typing import Any
 
 import casadi as ca
@@ -69,6 +70,8 @@ class DifferenceOptions:
         Share of a matrix over the box below which a derivative counts as zero.
     agreement : float
         Relative difference between the values of symbols and of numbers.
+    corners, inside : int
+        θ where these are compared, besides the middle: corners of the box at most, and inside.
     """
 
     step: float = 1e-3
@@ -77,6 +80,8 @@ class DifferenceOptions:
     jump: float = 1e-2
     noise: float = 1e-4
     agreement: float = 1e-9
+    corners: int = 16
+    inside: int = 6
 
 
 def user_plant(
@@ -90,8 +95,8 @@ def user_plant(
 ) -> Plant:
     """Make a plant of a user's model: CasADi expressions, or numbers with differences.
 
-    The expressions must give the numbers that the model returns for numbers, in the middle of the
-    box: `math.sqrt` or `float` of a symbol is silently nan.
+    The expressions must give the numbers that the model returns for numbers, over the box: `float`
+    of a symbol is silently nan, and a branch on it then goes one way everywhere.
 
     Parameters
     ----------
@@ -130,19 +135,42 @@ def user_plant(
             own = isinstance(of_numbers, PlantError) or not isinstance(error, PlantError)
             raise (of_numbers if own else error) from None
         return numeric.plant(f"{type(error).__name__}: {error}")
-    found = plant.evaluate(middle)
     try:
-        expected = numeric.values(middle)
+        numeric.values(middle)
     except Exception:
-        if all(np.isfinite(matrix).all() for matrix in found.matrices):
+        if all(np.isfinite(matrix).all() for matrix in plant.evaluate(middle).matrices):
             return plant  # the symbols are all it takes
         raise  # `float` of a symbol is nan: what it raised of numbers is what is wrong
-    for one, other in zip(found.matrices, expected.matrices, strict=True):
-        size = np.abs(other).max(initial=0.0)
-        gap = np.abs(one - other).max(initial=0.0)
-        if np.isfinite(size) and not gap <= differences.agreement * size:
-            return numeric.plant("its expressions differ from the numbers that it returns")
-    return plant
+    for theta in (middle, *_spread(box, differences)):  # a branch on a symbol goes one way
+        try:
+            reason = _disagreement(plant, numeric, theta)
+        except UserError:
+            reason = "it raises an error where its expressions have numbers"
+        if reason:
+            return numeric.plant(reason)
+    return replace(plant, mismatch=partial(_disagreement, plant, numeric))
+
+
+def _spread(box: Array, options: DifferenceOptions) -> Array:
+    """θ (k, n) where expressions and numbers are compared: corners of the box, and between.
+
+    In between are the points k α mod 1 of Roberts's sequence, α_i = φ⁻ⁱ with φⁿ⁺¹ = φ + 1.
+    """
+    n = box.shape[1]
+    corners = np.array(list(islice(product((0.0, 1.0), repeat=n), options.corners)))
+    golden = max(np.roots([1.0, *np.zeros(n - 1), -1.0, -1.0]).real)
+    inside = np.outer(np.arange(1, options.inside + 1), golden ** -np.arange(1.0, n + 1.0)) % 1.0
+    return np.asarray(box[0] + np.concatenate([corners, inside]) * (box[1] - box[0]))
+
+
+def _disagreement(plant: Plant, numeric: "DifferencedModel", theta: Sequence[float]) -> str:
+    """Words where the expressions of a traced model are not the numbers that it returns at θ."""
+    expected = numeric.values(np.asarray(theta, float))
+    for one, other in zip(plant.evaluate(theta).matrices, expected.matrices, strict=True):
+        size, gap = np.abs(other).max(initial=0.0), np.abs(one - other).max(initial=0.0)
+        if np.isfinite(size) and not gap <= numeric.differences.agreement * size:
+            return "its expressions differ from the numbers that it returns"
+    return ""
 
 
 def _at_theta(error: UserError, names: Sequence[str], theta: Sequence[float]) -> UserError:

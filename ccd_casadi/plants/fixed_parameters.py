@@ -123,6 +123,7 @@ def reparametrised(
         "nearby": nearby and (lambda known: of(nearby([own(theta) for theta in known]))),
         "notes": lambda theta: plant.notes(own(theta)),
         "doubt": lambda theta: plant.doubt(own(theta)),
+        "mismatch": lambda theta: plant.mismatch(own(theta)),
         "shapes": shapes and (lambda theta, count: shapes(own(theta), count)),
         "drawing": drawing and (lambda thetas: drawing({k: own(v) for k, v in thetas.items()})),
     }

@@ -122,6 +122,8 @@ class Plant:
         `evaluate` without derivatives where that is cheaper.
     notes, doubt : callable
         θ -> what a reader of a result there must know; what is wrong with the derivatives, else "".
+    mismatch : callable
+        θ -> how the matrices there differ from those that the function returns, else "".
     domain : tuple of two arrays (n,), optional
         Bounds of θ beyond which the plant is not known.
     unknown_between : str
@@ -148,6 +150,7 @@ class Plant:
     unknown_between: str = ""
     nearby: Callable[[Sequence[Sequence[float]]], Evaluate] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
+    mismatch: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
     drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
     callback: object = None

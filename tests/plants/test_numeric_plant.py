@@ -114,6 +114,39 @@ def test_a_model_of_symbols_stays_exact_and_one_with_a_moving_ratio_is_refused()
         plant.evaluate((2.0, 3e-3))
 
 
+@pytest.mark.parametrize("at", [0.05, 0.3, 0.7, 0.95])
+def test_a_branch_on_a_symbol_is_read_as_the_function_returns_it(at: float) -> None:
+    """`float` of a symbol is nan: traced, one side of the branch is taken in the whole box."""
+    edge = LOWER[0] + at * (UPPER[0] - LOWER[0])
+
+    def branched(theta):
+        found = model(theta)
+        factor = 0.25 if float(theta["m"]) < edge else 1.0
+        return found | {"stiffness": factor * found["stiffness"]}
+
+    plant = user_plant(branched, NAMES, {}, LOWER, UPPER)
+    for share in (0.0, 0.01, 0.2, 0.5, 0.8, 1.0):
+        theta = np.add(LOWER, share * np.subtract(UPPER, LOWER))
+        expected = branched(dict(zip(NAMES, theta, strict=True)))["stiffness"]
+        assert pytest.approx(np.array(expected), rel=1e-9) == plant.evaluate(theta).K
+
+
+def test_a_branch_that_no_compared_theta_shows_is_seen_where_it_is_judged() -> None:
+    """A window in the box that corners and points in between do not meet."""
+    traced = user_plant(model, NAMES, {}, LOWER, UPPER)
+    inside = tuple(np.add(LOWER, 0.37 * np.subtract(UPPER, LOWER)))
+
+    def window(theta):
+        found = model(theta)
+        factor = 2.0 if abs(float(theta["m"]) - inside[0]) < 1e-6 else 1.0
+        return found | {"stiffness": factor * found["stiffness"]}
+
+    plant = user_plant(window, NAMES, {}, LOWER, UPPER)
+    assert plant.notes(inside) == traced.notes(inside) == ()
+    assert plant.mismatch(inside) == "its expressions differ from the numbers that it returns"
+    assert plant.mismatch(tuple(LOWER)) == traced.mismatch(inside) == ""
+
+
 def test_ipopt_finds_the_least_cost_of_a_numeric_plant_as_of_the_exact_one() -> None:
     ends = []
     for plant in (build_plant(model, NAMES, {}), user_plant(numbers_only, NAMES, {}, LOWER, UPPER)):
