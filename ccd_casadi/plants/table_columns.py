@@ -1,7 +1,7 @@
 """Columns of numbers from CSV, .npz and .mat files, and what their names and units mean."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,8 +67,18 @@ def choices(quantity: str) -> str:
     return AS_WRITTEN.get(quantity, "m/N, mm/N, µm/N or nm/N")
 
 
+def refuse_polynomials(path: Path, names: Iterable[str]) -> None:
+    """Raise UserError where these names of a file, or of its struct, are a transfer function."""
+    given = {name.casefold(): name for name in names}
+    for num, den in (("num", "den"), ("numerator", "denominator")):
+        if {num, den} <= given.keys():
+            words = f"{given[num]} and {given[den]} are a transfer function, which is not read"
+            raise UserError(f"{path}: {words}; give A, B, C, D in a .mat file, or f_hz and G")
+
+
 def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColumn]:
     """Those that hold numbers, with the units that texts state; other texts are notes."""
+    refuse_polynomials(path, content)
     found = []
     for name, value in content.items():
         numbers = np.asarray(value.toarray() if scipy.sparse.issparse(value) else value)

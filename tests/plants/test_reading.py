@@ -324,6 +324,21 @@ def test_a_unit_that_is_not_clear_is_refused(
         read_frequency_response(path)
 
 
+@pytest.mark.parametrize("read", [read_frequency_response, read_mat])
+@pytest.mark.parametrize("names", [("num", "den"), ("Numerator", "Denominator")])
+@pytest.mark.parametrize("nested", [True, False])
+def test_a_transfer_function_in_a_file_is_refused_as_one(
+    tmp_path: Path, read: Callable, names: tuple[str, str], nested: bool
+) -> None:
+    polynomials = dict(zip(names, ([[1.0]], [[1.0, 2.0, 3.0]]), strict=True))
+    if nested and read is read_frequency_response:
+        return  # a struct is a model
+    savemat(tmp_path / "x.mat", {"sys": polynomials} if nested else polynomials)
+    words = f"{names[0]} and {names[1]} are a transfer function, which is not read; give A, B, C, D"
+    with pytest.raises(UserError, match=words):
+        read(tmp_path / "x.mat")
+
+
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize(
     ("units", "words"),
