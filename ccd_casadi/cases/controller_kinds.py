@@ -67,6 +67,14 @@ def idle_keys(data: Mapping[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
+def check_rate(tables: Mapping[str, Any], fail: Fail) -> None:
+    """Raise where |S| is bounded at a frequency that the sampled loop does not have."""
+    low, rate = tables["inner"].omega_low_hz, tables["loop"].rate_hz
+    if rate is not None and not low < 0.5 * rate:
+        words = f"is {low:g}, not below {0.5 * rate:g}, half of loop.rate_hz = {rate:g}"
+        raise fail("inner.omega_low_hz", f"{words}; lower it, or raise loop.rate_hz")
+
+
 def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where a key is given that has no effect on the chosen kind of inner problem."""
     controller, loop = tables["controller"], tables["loop"]
@@ -104,6 +112,7 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     if loop.delay_us and loop.rate_hz is None:
         words = "a delay needs a sampled loop, whose poles decide its stability; give loop.rate_hz"
         raise fail("loop.delay_us", words)
+    check_rate(tables, fail)
     if controller.biquads == 0 and controller.least_damping:
         words = "has no effect with biquads = 0; drop it"
         raise fail("controller.least_damping", words)

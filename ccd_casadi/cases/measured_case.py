@@ -22,6 +22,7 @@ from ccd_casadi.cases.checks import POSITIVE, Fail, count, require_good, short_r
 from ccd_casadi.cases.controller_kinds import (
     KindOptions,
     check_kind,
+    check_rate,
     idle_keys,
     structure_of,
     weights_of,
@@ -159,6 +160,7 @@ def _check(tables: Mapping[str, Any], fail: Fail) -> None:
     if loop.delay_us:
         words = "is in a response that was measured as the controller sees it; drop it"
         raise fail("loop.delay_us", words)
+    check_rate(tables, fail)
     others = {"objective": ObjectiveTable(0.0, -1.0), "robust": RobustTable(),
               "budget": BudgetTable()}  # fmt: skip
     if "weights" in tables:

@@ -225,7 +225,7 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     path : path
         CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
         phase_rad), or .mat or .npz with these names or with f_hz and a complex G. Beside them there
-        may be the `spread` of repeated measurements.
+        may be the `spread` of repeated measurements and, in .mat or .npz, the text `unit` of G.
 
     Returns
     -------

@@ -6,6 +6,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 (Paper, equations (1) and (2).)
 """
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -231,11 +232,18 @@ def model_parts(
         words = f"constraints is a {type(constraints).__name__}; return a mapping of name to value"
         raise PlantError(f'{words}, such as {{"too thin": 6.0 - t}}')
     missing = [key for key in _REQUIRED if key not in result]
+    unknown = sorted(map(str, set(result) - _KNOWN))
     if missing:
-        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
-    unknown = sorted(set(result) - _KNOWN)
+        near = {key: difflib.get_close_matches(key, unknown, 1) for key in missing}
+        renamed = [f"rename {found[0]} to {key}" for key, found in near.items() if found]
+        added = [key for key, found in near.items() if not found]
+        if added:
+            renamed.append(f"add {', '.join(added)}" if renamed else "add it")
+        raise PlantError(f"the plant model returns no {', '.join(missing)}; {', '.join(renamed)}")
     if unknown:
-        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
+        meant = difflib.get_close_matches(unknown[0], sorted(_KNOWN - set(result)), 1)
+        remedy = f"did you mean {meant[0]}?" if meant and len(unknown) == 1 else "drop it"
+        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; {remedy}")
     if ("damping" in result) == ("damping_ratio" in result):
         raise PlantError("the plant model must return either damping or damping_ratio; give one")
     M, K, B, C = (
@@ -251,16 +259,30 @@ def model_parts(
             raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
     _check_shapes(M, D, K, B, C)
-    ratio = result.get("damping_ratio")
-    if ratio is not None and not 0.0 < float(ratio) < 1.0:
-        words = "give a number between 0 and 1, both exclusive, such as 0.01"
-        raise PlantError(f"damping_ratio is {ratio}; {words}")
+    ratio = _damping_ratio(result.get("damping_ratio"))
     given = {"hardware_cost": result["hardware_cost"], **constraints}
     scalars = {key: _converted(kind, key, value) for key, value in given.items()}
     for key, value in scalars.items():
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
-    return (M, D, K, B, C), None if ratio is None else float(ratio), scalars
+    return (M, D, K, B, C), ratio, scalars
+
+
+def _damping_ratio(value: Any) -> float | None:
+    """Raises PlantError where it is not one number, that of every mode."""
+    if value is None:
+        return None
+    words = "between 0 and 1, both exclusive, such as 0.01"
+    if isinstance(value, ca.SX | ca.MX) and not value.is_constant():
+        raise PlantError("damping_ratio depends on theta; return damping, a matrix")
+    try:
+        ratio = float(value)
+    except (TypeError, ValueError, RuntimeError):
+        what = f"damping_ratio is a {type(value).__name__}"
+        raise PlantError(f"{what}; give one number {words}, or damping, a matrix") from None
+    if not 0.0 < ratio < 1.0:
+        raise PlantError(f"damping_ratio is {value}; give a number {words}")
+    return ratio
 
 
 def _converted(kind: Any, key: str, value: object) -> Any:

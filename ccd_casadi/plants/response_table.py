@@ -14,6 +14,7 @@ from ccd_casadi.plants.table_columns import (
     UNITS,
     WANTED,
     TableColumn,
+    choices,
     columns_of_arrays,
     columns_of_csv,
     meaning_of,
@@ -163,10 +164,8 @@ def _quantities(
             raise UserError(f"{path}: {words}; keep one")
         seen[quantity] = column.name
         if unit not in UNITS[quantity]:
-            usual = {"f": ("hz", "rad/s"), "angle": ("deg", "rad")}
-            choices = " or ".join(filter(None, usual.get(quantity, UNITS[quantity])))
             words = f"has the unit {unit!r}" if unit else "names no unit"
-            raise UserError(f"{path}: {column.name!r}: {words}; it may be {choices}")
+            raise UserError(f"{path}: {column.name!r}: {words}; it may be {choices(quantity)}")
         yield quantity, (column, UNITS[quantity][unit])
 
 

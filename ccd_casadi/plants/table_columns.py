@@ -1,8 +1,8 @@
 """Columns of numbers from CSV, .npz and .mat files, and what their names and units mean."""
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,10 @@ NAMES = {
     "g": "G", "response": "G",
     "spread": "spread", "coherence": "coherence",
 }  # fmt: skip
-COMPLIANCE = {"": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "µm/n": 1e-6, "nm/n": 1e-9}
+COMPLIANCE = {  # by the casefolded unit, in which both signs of micro are one
+    "": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "\N{GREEK SMALL LETTER MU}m/n": 1e-6,
+    "nm/n": 1e-9, "rad/(n m)": 1.0, "rad/n m": 1.0, "rad/nm": 1.0,
+}  # fmt: skip
 UNITS = {
     "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
     "size": COMPLIANCE | {"db": -1.0},  # a size in decibels
@@ -30,11 +33,15 @@ UNITS = {
     "re": COMPLIANCE, "im": COMPLIANCE, "G": COMPLIANCE, "spread": COMPLIANCE,
     "coherence": {"": 1.0},
 }  # fmt: skip
+AS_WRITTEN = {"f": "Hz or rad/s", "angle": "deg or rad", "size": "m/N, mm/N, µm/N, nm/N or dB"}
+UNIT_NAME = re.compile(r"(?:(.*?)[ _]*units?|units?[ _]+(?:of[ _]+)?(.*))", re.IGNORECASE)
+SI = ("", "m", "n", "m/n", "rad", "n m")  # a unit beside the columns that changes none of them
 WANTED = (
     "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 )
 READ = "CSV, .npz and .mat are read"
 DIGITS = "0123456789+-."
+_PLAIN = ("-", "1", "abs", "linear")  # units of a ratio
 
 
 def npz_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -55,8 +62,23 @@ class TableColumn:
     rows: tuple[int, ...] = ()
 
 
+def choices(quantity: str) -> str:
+    """The units of a quantity, as people write them."""
+    return AS_WRITTEN.get(quantity, "m/N, mm/N, µm/N or nm/N")
+
+
+def refuse_polynomials(path: Path, names: Iterable[str]) -> None:
+    """Raise UserError where these names of a file, or of its struct, are a transfer function."""
+    given = {name.casefold(): name for name in names}
+    for num, den in (("num", "den"), ("numerator", "denominator")):
+        if {num, den} <= given.keys():
+            words = f"{given[num]} and {given[den]} are a transfer function, which is not read"
+            raise UserError(f"{path}: {words}; give A, B, C, D in a .mat file, or f_hz and G")
+
+
 def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColumn]:
-    """Those that hold numbers; texts are notes."""
+    """Those that hold numbers, with the units that texts state; other texts are notes."""
+    refuse_polynomials(path, content)
     found = []
     for name, value in content.items():
         numbers = np.asarray(value.toarray() if scipy.sparse.issparse(value) else value)
@@ -72,7 +94,42 @@ def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColum
                 raise UserError(f"{path}: {name}: {numbers.shape} {words}")
             numbers = numbers.ravel()
         found.append(TableColumn(name, numbers))
+    for name, value in sorted(content.items(), key=lambda item: "spread" not in item[0].casefold()):
+        text = np.asarray(value)
+        stated = UNIT_NAME.fullmatch(name) if text.dtype.kind in "US" else None
+        if stated is None or not text.size:
+            continue
+        if text.size != 1:
+            raise UserError(f"{path}: {name}: holds several texts; give one unit")
+        unit = text.ravel()[0]
+        unit = (unit.decode("latin-1") if isinstance(unit, bytes) else str(unit)).strip()
+        found = _with_stated_unit(path, name, stated[1] or stated[2] or "", unit, found)
     return found
+
+
+def _with_stated_unit(
+    path: Path, name: str, of: str, unit: str, columns: Sequence[TableColumn]
+) -> list[TableColumn]:
+    """The columns with the unit in the text `name`: of the quantity `of`, or of the response. A
+    spread without its own unit has that of the response."""
+    responses = ("G", "re", "im", "size")
+    quantity = meaning_of(of) if of else None
+    meant = (quantity[0],) if quantity else responses
+    also = meant[0] in responses and unit.casefold() != "db"
+    if of and quantity is None:
+        if unit.casefold() not in SI:
+            words = f"is {unit!r} and is not understood; give the unit of the response as unit"
+            raise UserError(f"{path}: {name}: {words}")
+        return list(columns)
+    if unit and unit.casefold() not in {*_PLAIN, *(word for key in meant for word in UNITS[key])}:
+        raise UserError(f"{path}: {name}: is {unit!r}; it may be {choices(meant[0])}")
+    return [
+        replace(column, name=_with_unit(path, name, column.name, unit))
+        if (own := meaning_of(column.name))
+        and (own[0] in meant or (also and own == ("spread", "")))
+        else column
+        for column in columns
+    ]
 
 
 def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
@@ -105,7 +162,7 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
         and all(cell.casefold() in units for cell in names)
         and len(rows[at - 1][1]) == len(names)
     ):
-        names = [_with_unit(path, rows[at][0], name, unit)
+        names = [_with_unit(path, f"line {rows[at][0]}", name, unit)
                  for name, unit in zip(rows[at - 1][1], names, strict=True)]  # fmt: skip
         notes.append(f"line {rows[at][0]} holds the units")
         at -= 1
@@ -210,16 +267,16 @@ def meaning_of(name: str) -> tuple[str, str] | None:
     base, unit = bracket.groups() if bracket else name.split(" ", 1) if " " in name else (name, "")
     if base not in NAMES:
         return None
-    unit = "" if bracket and unit in ("-", "1", "abs", "linear") else unit
+    unit = "" if bracket and unit in _PLAIN else unit
     return NAMES[base], unit
 
 
-def _with_unit(path: Path, line: int, name: str, unit: str) -> str:
-    """The name of a column with the unit that a line below it states."""
+def _with_unit(path: Path, place: str, name: str, unit: str) -> str:
+    """The name of a column with the unit that is stated at another place."""
     found = meaning_of(name)
     if not unit or found is None or not found[1]:
         return f"{name} ({unit})" if unit else name
     factors = [UNITS[found[0]].get(word) for word in (found[1], unit.casefold())]
     if factors[0] != factors[1]:
-        raise UserError(f"{path}: line {line}: gives {name!r} the unit {unit!r}; keep one")
+        raise UserError(f"{path}: {place}: gives {name!r} the unit {unit!r}; keep one")
     return name

@@ -88,8 +88,12 @@ def as_lines(
     T = 1.0 / rate_hz
     if not own:
         model = sampled(system, T, delay)
-    elif not np.isclose(own, T) or not np.isclose(delay_parts(T, delay)[1], 0.0, atol=1e-6 * T):
-        raise UserError("a plant in discrete time runs at its rate, and a delay of whole periods")
+    elif not np.isclose(own, T):
+        words = f"the plant is sampled at {1.0 / own:.6g} Hz and the controller at {rate_hz:.6g} Hz"
+        raise UserError(f"{words}; give the plant's rate (--rate-hz) or the continuous plant")
+    elif not np.isclose(delay_parts(T, delay)[1], 0.0, atol=1e-6 * T):
+        words = f"the delay is {delay:.6g} s, {delay / T:.4g} periods of {T:.6g} s, and the plant"
+        raise UserError(f"{words} is sampled; give whole periods (--delay) or the continuous plant")
     else:
         whole = delay_parts(T, delay)[0]
         model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)

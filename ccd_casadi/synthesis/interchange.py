@@ -20,6 +20,7 @@ import scipy
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
+from ccd_casadi.plants.table_columns import refuse_polynomials
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.worker_process import one_blas_thread
@@ -234,6 +235,9 @@ def read_mat(path: Path) -> DesignFile:
     content = mat_variables(path)
     systems = {name: _named(path, name, fields) for name, fields in systems_in(path, content)}
     if not systems:
+        structs = (value.dtype.names for value in content.values() if isinstance(value, np.ndarray))
+        for group in (content, *filter(None, structs)):
+            refuse_polynomials(path, group)
         words = "holds no struct with A, B, C, D, nor f_hz and G of a response"
         raise UserError(f"{path}: {words}; save one for each system")
     names = strings(content.get("theta_names"))

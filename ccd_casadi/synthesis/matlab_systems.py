@@ -149,6 +149,9 @@ PARTS = ("A", "B", "C", "D")
 OF_NAMES = {"name", "notes", "userdata", "statename", "stateunit", "statepath", "inputname",
             "inputunit", "inputgroup", "outputname", "outputunit", "outputgroup", "samplinggrid",
             "scaled", "theta", "theta_names", "theta_units"}  # fmt: skip
+SI = ("", "m", "rad", "N", "Nm")  # units of signals, without what joins their factors
+QUANTITIES = (("Nm", "newton metres"), ("N", "newtons"), ("rad", "radians"), ("deg", "radians"),
+              ("°", "radians"), ("m", "metres"))  # fmt: skip
 DELAYS = ("InputDelay", "OutputDelay", "IODelay")
 SECONDS = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "seconds": 1.0,
            "minutes": 60.0, "hours": 3600.0, "days": 86400.0}  # fmt: skip
@@ -231,6 +234,7 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
         if (np.eye(n) != E).any():
             A, B = (np.asarray(np.linalg.solve(E, part), float) for part in (A, B))
             many.append("E is inverted")
+    reader.require_si()
     unit, word = reader.time_unit()
     Ts = unit * reader.number("Ts")
     if word != "seconds":
@@ -275,6 +279,18 @@ class _Fields:
         if found.size != 1:
             raise self.fail(key, "is not one number")
         return float(found[0, 0])
+
+    def require_si(self) -> None:
+        """Raise where the unit of an input or output is another than that of SI."""
+        other = {"Input": "newtons or newton metres", "Output": "metres or radians"}
+        for side, usual in other.items():
+            key = f"{side}Unit"
+            for unit in strings(self.fields.get(key.casefold())) if self.given(key) else ():
+                joined = "".join(unit.split()).translate(dict.fromkeys(map(ord, "*.·⋅")))
+                if joined not in SI:
+                    ends = (words for end, words in QUANTITIES if joined.endswith(end))
+                    words = f"give the {side.lower()}s in {next(ends, usual)}"
+                    raise self.fail(key, f"is {unit.strip()}: {words}, and scale the matrices")
 
     def time_unit(self) -> tuple[float, str]:
         """Seconds in its unit of time, and that."""

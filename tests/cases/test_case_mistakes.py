@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from oracles.case_documents import DOCUMENT, DROP, edited, message
 
-from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.support.errors import UserError
 
 # Every kind of mistake: what is changed, the key that is named, and the remedy.
@@ -130,6 +130,16 @@ def test_a_mistake_is_told_with_its_key_and_its_remedy(
 def test_a_key_that_holds_line_ends_or_escapes_stays_on_one_line() -> None:
     text = message(edited(("inner", DOCUMENT["inner"] | {"a\nb\u2028c\x1b[31m": 1})))
     assert text.startswith(r"runs/x.toml: inner.a b c\x1b[31m: unknown key")
+
+
+@pytest.mark.parametrize(("low", "rate"), [(6.0, 10.0), (5.0, 10.0), (1.0, 0.5)])
+def test_a_bound_above_half_the_rate_is_told_with_both_numbers(low: float, rate: float) -> None:
+    sections = ("controller", {"structure": "sections", "biquads": 0, "weighted_level": 9.0})
+    text = message(edited(sections, ("loop.rate_hz", rate), ("inner.omega_low_hz", low)))
+    words = f"is {low:g}, not below {0.5 * rate:g}, half of loop.rate_hz = {rate:g}; lower it"
+    assert text.startswith(f"runs/x.toml: inner.omega_low_hz: {words}")
+    below = edited(sections, ("loop.rate_hz", 2.1 * low), ("inner.omega_low_hz", low))
+    assert parse_case(below).inner.omega_low_hz == low
 
 
 def test_a_long_value_is_cut() -> None:

@@ -315,6 +315,13 @@ def model_of(changes: dict, drop: tuple[str, ...] = ()):
         ({}, ("mass",), "returns no mass; add it"),
         ({}, ("input", "output"), "returns no input, output; add it"),
         ({"mess": 1.0}, (), "unknown mess; drop it"),
+        ({"hardware_costs": 1.0}, ("hardware_cost",),
+         "returns no hardware_cost; rename hardware_costs to hardware_cost"),
+        ({"Mass": 1.0}, ("mass", "output"), "rename Mass to mass, add output"),
+        ({"damping_ratios": 1.0}, ("damping_ratio",), "did you mean damping_ratio?"),
+        ({"damping_ratio": (0.01,)}, (), "damping_ratio is a tuple; give one number between 0"),
+        ({"damping_ratio": [0.01, 0.02]}, (), "damping_ratio is a list; give one number"),
+        ({"damping_ratio": ca.SX.sym("z")}, (), "damping_ratio depends on theta; return damping"),
         ({"damping": np.zeros((2, 2))}, (), "either damping or damping_ratio"),
         ({}, ("damping_ratio",), "either damping or damping_ratio"),
         ({"stiffness": np.eye(3)}, (), "stiffness is (3, 3), the mass matrix (2, 2)"),
@@ -326,7 +333,7 @@ def model_of(changes: dict, drop: tuple[str, ...] = ()):
         ({"damping_ratio": 1.5}, (), "damping_ratio is 1.5; give a number between 0 and 1"),
         ({"damping_ratio": -0.1}, (), "damping_ratio is -0.1"),
     ],
-)
+)  # fmt: skip
 def test_wrong_model_is_named_when_it_is_built(changes, drop, words: str) -> None:
     with pytest.raises(PlantError, match=re.escape(words)):
         build_plant(model_of(changes, drop), ["t"], {})

@@ -56,7 +56,8 @@ def test_each_fault_is_told_as_what_it_is(tmp_path: Path, line: str, words: str)
     ("more", "words"),
     [(', "constraints": [a - 80.0]', "constraints is a list"),
      (', "constraints": None', "constraints is a NoneType"),
-     (', "constraints": {"heavy": None}', "heavy is None")],
+     (', "constraints": {"heavy": None}', "heavy is None"),
+     (', **{"damping_ratio": (0.01,)}', "damping_ratio is a tuple; give one number")],
 )  # fmt: skip
 def test_what_is_returned_in_another_form_is_named(tmp_path: Path, more: str, words: str) -> None:
     with pytest.raises(CaseError, match=words):

@@ -229,7 +229,7 @@ def test_no_table_is_read_as_another(seed: int, tmp_path: Path) -> None:
         ("f_hz,re,im\n1,5,0,2,0,3\n", "line 2: has 6 cells and the header 3: are its decimals"),
         ("f_hz;re;im\n1,234;5,678;9,123\n", "line 2: a comma may be a decimal or part thousands"),
         ("f_hz;re;im\n1.5;5,678;9,123\n", "line 2: a comma may be"),
-        ("f,re,im\n1,2,3\n", "'f': names no unit; it may be hz or rad/s"),
+        ("f,re,im\n1,2,3\n", "'f': names no unit; it may be Hz or rad/s"),
         ("    -1\n    58\n", "universal file"),
     ],
 )
@@ -247,3 +247,123 @@ def test_a_line_at_0_hz_and_a_row_of_units_are_reported(tmp_path: Path) -> None:
     assert found.hz[0] == 1.0
     assert "line 2 holds the units" in found.words
     assert "line 3 at 0 Hz is left out" in found.words
+
+
+def lines_of_six() -> tuple[np.ndarray, np.ndarray]:
+    hz = np.arange(1.0, 7.0)
+    return hz, 1.0 / (1j * HZ * hz + 3.0)
+
+
+def written_arrays(path: Path, content: Fields) -> Path:
+    (np.savez if path.suffix == ".npz" else lambda p, **c: savemat(p, c))(path, **content)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+@pytest.mark.parametrize("name", ["unit", "Units", "G_unit", "unit_of_response"])
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("m/N", 1.0), ("mm/N", 1e-3), ("um/N", 1e-6), ("\xb5m/N", 1e-6), ("\u03bcm/N", 1e-6),
+     ("nm/N", 1e-9), ("rad/(N m)", 1.0), ("-", 1.0), ("", 1.0)],
+)  # fmt: skip
+def test_the_unit_in_a_text_is_that_of_the_response(
+    tmp_path: Path, suffix: str, name: str, unit: str, factor: float
+) -> None:
+    hz, G = lines_of_six()
+    content: Fields = {"f_hz": hz, "G": G, "spread": 0.1 * np.abs(G), name: unit, "note": "um/N"}
+    found = read_frequency_response(written_arrays(tmp_path / f"x{suffix}", content))
+    np.testing.assert_allclose(found.G, factor * G, rtol=1e-12)
+    assert found.spread is not None
+    np.testing.assert_allclose(found.spread, 0.1 * factor * np.abs(G), rtol=1e-12)
+    np.testing.assert_allclose(found.hz, hz)
+
+
+def test_a_spread_keeps_the_unit_of_its_own(tmp_path: Path) -> None:
+    hz, G = lines_of_six()
+    content: Fields = {"f_hz": hz, "G": G, "spread": np.abs(G), "unit": "um/N",
+                       "spread_unit": "nm/N"}  # fmt: skip
+    found = read_frequency_response(written_arrays(tmp_path / "x.npz", content))
+    assert found.spread is not None
+    np.testing.assert_allclose(found.spread, 1e-3 * np.abs(found.G), rtol=1e-12)
+
+
+def test_units_of_single_columns_are_those_of_a_table_of_text(tmp_path: Path) -> None:
+    hz, G = lines_of_six()
+    parts: Fields = {"frequency": hz / 1e3, "re": G.real, "im": G.imag, "frequency_unit": "kHz",
+                     "units": "\xb5m/N"}  # fmt: skip
+    found = read_frequency_response(written_arrays(tmp_path / "x.npz", parts))
+    rows = "".join(f"{f!r},{g.real!r},{g.imag!r}\n" for f, g in zip(
+        (hz / 1e3).tolist(), G.tolist(), strict=True))  # fmt: skip
+    (tmp_path / "x.csv").write_text(f"frequency,re,im\nkHz,\xb5m/N,\xb5m/N\n{rows}")
+    table = read_frequency_response(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.G, table.G, rtol=1e-12)
+    np.testing.assert_allclose(found.G, 1e-6 * G, rtol=1e-12)
+    np.testing.assert_allclose(found.hz, table.hz, rtol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        ({"unit": "furlong/N"}, "unit: is 'furlong/N'; it may be m/N, mm/N, µm/N or nm/N"),
+        ({"unit": "Hz"}, "unit: is 'Hz'; it may be m/N"),
+        ({"f_unit": "um/N"}, "f_unit: is 'um/N'; it may be Hz or rad/s"),
+        ({"f_hz_unit": "rad/s"}, "f_hz_unit: gives 'f_hz' the unit 'rad/s'; keep one"),
+        ({"unit": "dB"}, "has the unit 'db'; it may be m/N, mm/N, µm/N or nm/N"),
+        ({"OutputUnit": "um"}, "OutputUnit: is 'um' and is not understood; give the unit"),
+        ({"unit": ["um/N", "nm/N"]}, "unit: holds several texts; give one unit"),
+        ({"unit": "um/N", "G_unit": "nm/N"}, "keep one"),
+    ],
+)
+def test_a_unit_that_is_not_clear_is_refused(
+    tmp_path: Path, suffix: str, texts: Fields, words: str
+) -> None:
+    hz, G = lines_of_six()
+    path = written_arrays(tmp_path / f"x{suffix}", {"f_hz": hz, "G": G, **texts})
+    with pytest.raises(UserError, match=re.escape(words)):
+        read_frequency_response(path)
+
+
+@pytest.mark.parametrize("read", [read_frequency_response, read_mat])
+@pytest.mark.parametrize("names", [("num", "den"), ("Numerator", "Denominator")])
+@pytest.mark.parametrize("nested", [True, False])
+def test_a_transfer_function_in_a_file_is_refused_as_one(
+    tmp_path: Path, read: Callable, names: tuple[str, str], nested: bool
+) -> None:
+    polynomials = dict(zip(names, ([[1.0]], [[1.0, 2.0, 3.0]]), strict=True))
+    if nested and read is read_frequency_response:
+        return  # a struct is a model
+    savemat(tmp_path / "x.mat", {"sys": polynomials} if nested else polynomials)
+    words = f"{names[0]} and {names[1]} are a transfer function, which is not read; give A, B, C, D"
+    with pytest.raises(UserError, match=words):
+        read(tmp_path / "x.mat")
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        ({"OutputUnit": "um", "InputUnit": "N"}, "OutputUnit: is um: give the outputs in metres"),
+        ({"OutputUnit": "mrad"}, "OutputUnit: is mrad: give the outputs in radians"),
+        ({"OutputUnit": "in"}, "OutputUnit: is in: give the outputs in metres or radians"),
+        ({"InputUnit": "kN"}, "InputUnit: is kN: give the inputs in newtons"),
+        ({"InputUnit": "mN m"}, "InputUnit: is mN m: give the inputs in newton metres"),
+        ({"InputUnit": "V"}, "InputUnit: is V: give the inputs in newtons or newton metres"),
+        ({"OutputUnit": np.array([["m"], ["nm"]], dtype=object)}, "OutputUnit: is nm: give"),
+        ({"OutputUnit": "m", "InputUnit": "N"}, ""),
+        ({"OutputUnit": "rad", "InputUnit": "N m"}, ""),
+        ({"OutputUnit": "rad", "InputUnit": "N*m"}, ""),
+        ({"OutputUnit": "N", "InputUnit": "m"}, ""),
+        ({"OutputUnit": "", "InputUnit": []}, ""),
+    ],
+)
+def test_a_model_in_another_unit_is_refused(
+    tmp_path: Path, nested: bool, units: Fields, words: str
+) -> None:
+    m = random_model(np.random.default_rng(0)) | units
+    savemat(tmp_path / "x.mat", {"sys": m} if nested else m)
+    if not words:
+        assert read_mat(tmp_path / "x.mat").systems
+        return
+    with pytest.raises(UserError, match=re.escape(words)):
+        read_mat(tmp_path / "x.mat")

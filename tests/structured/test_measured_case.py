@@ -76,9 +76,11 @@ def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
         ("A_u = 1e-2", "", "weights.A_u: is missing"),
         ("S_max = 2.0", "S_max = 0.5", "inner.S_max"),
         ("biquads = 0", "biquads = 0\n[loop]\nrate_hz = 1e4\ndelay_us = 10.0", "loop.delay_us"),
+        ("biquads = 0", "biquads = 0\n[loop]\nrate_hz = 1.5",
+         "inner.omega_low_hz: is 1, not below 0.75, half of loop.rate_hz = 1.5; lower it"),
         ("[inner]", '[inner]\nminimise = "rms_error"', "inner.minimise: needs a model"),
     ],
-)
+)  # fmt: skip
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(CaseError, match=words):
         measured_case(written(tmp_path, CASE.replace(old, new), lines=20))

@@ -170,11 +170,13 @@ def test_the_bound_of_effort_has_its_slope() -> None:
         (LAGS, {}, "rate_hz is missing"),
         (s / (s + 1.0) ** 2, {"rate_hz": 10.0}, "a zero at 0"),
         ((s + 2.0) / (s + 1.0), {"rate_hz": 10.0}, "feedthrough"),
-        (control.sample_system(LAGS, 0.1), {"rate_hz": 20.0}, "runs at its rate"),
-        (control.sample_system(LAGS, 0.1), {"delay": 0.05}, "whole periods"),
+        (control.sample_system(LAGS, 0.1), {"rate_hz": 20.0},
+         "plant is sampled at 10 Hz and the controller at 20 Hz; give the plant's rate"),
+        (control.sample_system(LAGS, 0.1), {"delay": 0.05},
+         "the delay is 0.05 s, 0.5 periods of 0.1 s, and the plant is sampled; give whole periods"),
         ("none.csv", {}, "cannot be read"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_plant_is_said(plant: object, how: dict, words: str) -> None:
     with pytest.raises(UserError, match=words):
         ccd.tune(plant, **how)
