@@ -38,7 +38,7 @@ from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.text import HZ, counted, told_apart
 
 
 @dataclass(frozen=True)
@@ -242,10 +242,14 @@ class VerifiedStructured(Verified):
         found, of = [optimum.bandwidth / HZ for optimum in self.multistart.design.local_optima], ""
         if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
-        multistart = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a multi-start search at this theta ended at {multistart} Hz{of}"
+        words = f"{multistart_words(found)}{of}"
         design = self.multistart.design
         if design.found is not None and design.found < DesignOptions.repeats:
             words += f", its best not found again from {counted(design.starts, 'start')}"
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
         return f"{words}; {known}", figures
+
+
+def multistart_words(ends: Sequence[float]) -> str:
+    """Where the searches of a multi-start search ended, in Hz, each apart from the others."""
+    return f"a multi-start search at this theta ended at {', '.join(told_apart(ends))} Hz"

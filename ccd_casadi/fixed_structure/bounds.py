@@ -20,6 +20,7 @@ BINDS = {
     "T": "weighted_level of T",
     "GS": "compliance_max",
 }
+WORDS = {**BINDS, "CROSSING": "|S| at omega_b"}  # that row defines ω_b and is not a bound of a case
 
 
 def kind_and_channel(name: str) -> tuple[str, str]:
@@ -53,9 +54,12 @@ def key_words(name: str) -> str:
     Returns
     -------
     str
+
+    >>> key_words("CROSSING"), key_words("S_MAX of tilt")
+    ('|S| at omega_b', 'S_max of channel tilt')
     """
     kind, channel = kind_and_channel(name)
-    return BINDS.get(kind, kind) + (f" of channel {channel}" if channel else "")
+    return WORDS.get(kind, kind) + (f" of channel {channel}" if channel else "")
 
 
 @dataclass(frozen=True, kw_only=True)

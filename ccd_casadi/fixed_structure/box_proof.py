@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
@@ -238,7 +238,8 @@ class Proof:
         """The outcome in one line, with its levels."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
-            return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
+            name, factor = key_words(self.passed[0]), self.passed[1]
+            return f"{name} is exceeded by a factor of {factor:.4g} at {at}"
         if self.outcome is ProofOutcome.UNSTABLE:
             return f"the proof denies it: {self.outcome.value}"
         if not self.stable:
@@ -246,10 +247,15 @@ class Proof:
         left = f"; {self.unasked}" if self.channels else ""
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
-            over = [name for name, level in self.levels.items() if not level <= 1.0 + self.slack]
+            over = [
+                key_words(name)
+                for name, level in self.levels.items()
+                if not level <= 1.0 + self.slack
+            ]
+            whose = "its bound" if len(over) == 1 else "their bounds"
             return (
                 f"not every bound is proven: the whole box is stable by {self.boxes} enclosures, "
-                f"but {', '.join(over)} only below {worst:.5g} of its bound{left}"
+                f"but {', '.join(over)} only below {worst:.5g} of {whose}{left}"
             )
         of_S = max((v for k, v in self.levels.items() if k not in ("KS", "T", "GS")), default=0.0)
         own = f"|S| at most {of_S:.5g} and " if of_S < worst else ""

@@ -21,12 +21,13 @@ from ccd_casadi.support.text import with_unit
 from surrogates.files import write_whole
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
-NEXT = {  # what to do about a line that failed
+NEXT = {  # what to do about a line that failed, or about what the decision names
     "certified": "solve the case again",
     "optimal": "more starts or box_points in [outer]",
     "predicted": "retrain, or more points in [sampling]",
     "survives": "a [robust] set in the case",
     "deployable": "a higher rate or less delay",
+    "unproven": "a smaller [robust] set, or fewer parameters in it",
     "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
 }
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
@@ -186,18 +187,19 @@ def advice(result: Mapping[str, Any]) -> str:
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
-    if states.get("survives") == State.WARNED:
-        own = result["verdict"]["survives"].get("set")
-        if own == OwnSet.UNPROVEN:
-            return (
-                "Build this only if you accept: the bounds are not proven on the whole [robust] "
-                "set. Next: a smaller set, or fewer parameters in it."
-            )
+    own = result["verdict"].get("survives", {}).get("set")
+    unclosed = states.get("survives") == State.WARNED and own == OwnSet.UNPROVEN
+    if states.get("survives") == State.WARNED and not unclosed:
         words = "Do not build this: it does not survive small errors of its model."
         if own == OwnSet.NONE:
             words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
-    warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]
+    warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else []
+    warned += [
+        f"{name} warned"
+        for name, state in states.items()
+        if state == State.WARNED and name != "survives"
+    ]
     if states.get("survives") == State.UNKNOWN:
         if unproven(result) == "not known":
             words = "Do not build this yet: what it survives is not known."
@@ -206,8 +208,9 @@ def advice(result: Mapping[str, Any]) -> str:
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
+        steps = [NEXT["unproven"]] * unclosed + [NEXT["loop"]] * bool(looked_at)
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
-        return words + (f" Next: {NEXT['loop']}." if looked_at else "") + after
+        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after
     return (
         "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
     )

@@ -4,6 +4,7 @@ import importlib.metadata
 import math
 import platform
 import re
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -211,6 +212,32 @@ def number(value: Any, digits: int = 5) -> str:
         # never fewer digits than the whole part has: 110023 stays 110023
         digits = max(digits, len(str(round(size))))
     return f"{float(value):.{digits}g}"
+
+
+def told_apart(values: Sequence[float], digits: int = 4) -> list[str]:
+    """Write numbers with as many digits as keep unequal ones apart, six more than `digits` at most.
+
+    Parameters
+    ----------
+    values : sequence of float
+    digits : int
+        Significant digits, at least.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> told_apart([0.2402, 0.2391, 0.23]), told_apart([288.571, 288.574])
+    (['0.2402', '0.2391', '0.23'], ['288.571', '288.574'])
+    """
+    found: list[str] = []
+    for more in range(digits, digits + 7):
+        found = [number(value, more) for value in values]
+        if len(set(found)) == len(set(values)):
+            break
+    return found
 
 
 PLAIN = (".c", ".h", ".md", ".st", ".txt")  # what no mark-up is in

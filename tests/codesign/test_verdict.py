@@ -1,6 +1,7 @@
 """The verdict: states follow their figures; what is not optimal is never verified; kinks count."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.codesign.verified_structured import multistart_words
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure import SetCertificate
@@ -93,6 +95,17 @@ def test_the_look_at_the_box_is_said() -> None:
     assert "-290" in words
     assert "20 fresh spread theta and 12 that the run had solved" in words
     assert "none better at 20 fresh" in optimal_line(1e-9, look=replace(look, x=None)).words
+
+
+@given(st.floats(1e-2, 1e4), st.floats(1e-3, 0.5))
+def test_the_ends_of_a_search_are_told_apart(first: float, share: float) -> None:
+    """Of a slow loop too, to four digits at least."""
+    ends = [first, first * (1.0 - share)]
+    words = multistart_words(ends)
+    shown = [float(value) for value in re.findall(r"[\d.]+", words)]
+    assert shown == pytest.approx(ends, rel=5.1e-4)
+    assert shown[0] != shown[1]
+    assert "ended at 0.2402, 0.2391, 0.2352 Hz" in multistart_words([0.24021, 0.23911, 0.23518])
 
 
 REACH = SurvivalOptions().reach

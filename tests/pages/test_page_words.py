@@ -178,6 +178,27 @@ def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
         assert said not in advice(result_of(survives="failed") | figures)
 
 
+def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
+    """Nor a line that warned; and the decision of the page is the one of the terminal."""
+    rings = "the closed loop rings at 159.8 Hz with damping 0.00103"
+    poor = {"step_overshoot": 0.71, "settling_ms": 40.0, "gain_margin": 1.786,
+            "phase_margin_deg": 28.2, "loop_warnings": [rings]}  # fmt: skip
+    result = result_of(survives="warned", predicted="warned", deployable="unknown")
+    result["verdict"]["survives"]["set"] = OwnSet.UNPROVEN
+    bare, said = advice(result), advice(result | poor)
+    for words in ("not proven on the whole [robust] set", "predicted warned", "Deploy it first",
+                  "Next: a smaller [robust] set"):  # fmt: skip
+        assert words in bare
+        assert words in said
+    concerns = ("overshoots by 71 %", "gain margin is 1.79", "phase margin is 28.2 deg", rings,
+                "smaller S_max")  # fmt: skip
+    for words in concerns:
+        assert words in said
+        assert words not in bare
+    assert said.startswith("Build this only if you accept: the bounds are not proven")
+    assert run_head("", result | poor, "", "").decision == said
+
+
 def test_what_s_may_reach_between_two_lines_is_said_first() -> None:
     tuned = {"sensitivity_peak": 1.8, "sensitivity_peak_between_lines": 4.78}
     assert "4.78 between two lines" in advice(tuned)

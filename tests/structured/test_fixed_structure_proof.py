@@ -1,15 +1,19 @@
 """The proof over a box of plants: enclosures hold, and what does not hold is not proven."""
 
+import re
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
 from oracles.fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
 from oracles.helpers import HZ, two_mass_model
 
+from ccd_casadi.codesign.result_entries import bound_words
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
-from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.bounds import key_words
+from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
@@ -186,3 +190,20 @@ def test_affine_forms_enclose_what_they_say() -> None:
     here = np.array([[0.0], [0.7], [0.0]])
     assert encloses(root(x * x), here, np.array([1.85]))
     assert np.isfinite(inverse(f).rest).mean() > 0.5
+
+
+@pytest.mark.parametrize("curve", LoopCurve)
+def test_words_name_a_bound_as_a_reader_knows_it(curve: LoopCurve) -> None:
+    """No name of an enumeration is in what a proof, a missed bound or a search says of any row."""
+    known = ("weighted_level of KS", "weighted_level of T")
+    for row in (curve.name, f"{curve.name} of tilt"):
+        proof = Proof(ProofOutcome.OPEN, 1e-3, ("damping",), {row: 1.03}, point=(0.5,),
+                      passed=(row, 1.03))  # fmt: skip
+        said = [replace(proof, outcome=outcome).words for outcome in ProofOutcome]
+        said += [BOUNDS.missed(row, 1.41), key_words(row), *bound_words([row])]
+        for words in said:
+            plain = reduce(lambda text, name: text.replace(name, ""), known, words)
+            names = {one.name for kind in (LoopCurve, ProofOutcome, Chart) for one in kind}
+            assert not names & set(re.findall(r"\w+", plain)), words
+        assert key_words(row) in said[list(ProofOutcome).index(ProofOutcome.LOOSER)]
+        assert key_words(row) in said[list(ProofOutcome).index(ProofOutcome.REFUTED)]
