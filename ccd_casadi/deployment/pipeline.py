@@ -186,6 +186,13 @@ def deploy(
         No sampling rate is enough, or the given one is no rate for this loop.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
+    if not np.isfinite(full.bandwidth):
+        fastest = float(np.abs(np.linalg.eigvals(K.A)).max(initial=0.0)) / HZ
+        words = f"no bandwidth was measured of its loop ({full.outcome.value})"
+        raise UserError(
+            f"{run.folder}: {words}; K has a pole at {fastest:.3g} Hz: leave out of the plant what "
+            "lies far above the loop, such as a stiff link"
+        )
     designed, family, dense = run.problem.sampling, members(run), members(run, dense=True)
     target = Target(inner.S_max, options.sampled_excess, full.bandwidth, options.sampled_bandwidth)
     if kind_of(run.problem).as_designed:

@@ -33,6 +33,7 @@ from ccd_casadi.deployment.realisation import assemble, scalar_channels
 from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
@@ -200,6 +201,13 @@ def test_a_rate_that_does_not_do_names_the_one_that_does(
     assert "shorten it" in capsys.readouterr().err
     assert main([str(two_mass_run), *out, "--rate-hz", "100", *QUICK]) == 2
     assert "sample faster" in capsys.readouterr().err
+
+
+def test_a_loop_without_a_bandwidth_is_refused_in_one_line(two_mass_run: Path) -> None:
+    run = read_run(two_mass_run)
+    lost = replace(run, figures=replace(run.figures, bandwidth=np.nan))
+    with pytest.raises(UserError, match=r"no bandwidth was measured .* K has a pole at \d"):
+        deploy(lost, Timing())
 
 
 def test_an_unstable_loop_leaves_no_code(
