@@ -145,9 +145,10 @@ def survived(
     if isinstance(design, SectionsDesign) and design.certificate is not None:
         peak = max(plant.S_peak for plant in design.certificate.plants)
     # What the first engine finds above S_max fails its own line; only the second is judged here.
+    slack = float(np.fmax(1.0, peak / inner.S_max)) * (1.0 + slack) - 1.0
     found = survival(
-        loops, S_max=float(np.fmax(inner.S_max, peak)), bandwidth=design.bandwidth,
-        omega_low=inner.omega_low, slack=slack, marks=marks,
+        loops, S_max=inner.S_max, bandwidth=design.bandwidth, omega_low=inner.omega_low,
+        slack=slack, marks=marks, held=kind_of(problem).common_shifts(),
     )  # fmt: skip
     return found, check_robust(problem, loops)
 

@@ -27,6 +27,7 @@ from ccd_casadi.synthesis.closed_loop import least_margins
 from ccd_casadi.synthesis.statics import Statics, StaticsOptions, statics
 
 PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
+STATED = 2.0 * PEAK  # the excess of S_max from which on the words state it
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,7 @@ class Survival:
     unstable_poles_hz: tuple[float, ...]
     statics: Statics
     contradiction: str = ""
+    S_max_slack: float = PEAK  # relative: by what ‖S‖∞ may exceed S_max within `S_max_shift`
 
     def within(self, low: float, high: float) -> bool:
         """Whether S_max holds for all resonance shifts from `low` to `high`."""
@@ -300,6 +302,44 @@ def shift_range(
     return end(-1.0), end(1.0)
 
 
+def range_within(
+    loops: LoopsOffModel,
+    search: Callable[[Callable[[Loop], float]], tuple[float, float]],
+    S_max: float,
+    loose: float,
+    held: tuple[float, float],
+) -> tuple[tuple[float, float], float]:
+    """The range within which ‖S‖∞ meets S_max, and by what it may exceed S_max there.
+
+    That is `PEAK`. Only where the range would then end in the part that the design was searched to
+    hold by `loose`, and does, it is `loose`.
+
+    Parameters
+    ----------
+    loops : LoopsOffModel
+        Of the controller.
+    search : function
+        Of a figure of Loop: the ends up to which it is not positive, as `shift_range`.
+    S_max, loose : float
+        Of ‖S‖∞; relative.
+    held : (float, float)
+        The ends of that part.
+
+    Returns
+    -------
+    ends : tuple of float
+    slack : float
+        Relative.
+    """
+    model, found = loops.at(Perturbation()), list[tuple[float, float]]()
+    for slack in (PEAK, max(PEAK, loose)):
+        excess = partial(excess_of, level=S_max * (1.0 + slack))
+        found.append(search(excess))
+        if excess(model) <= 0.0 and found[-1][0] <= held[0] and held[1] <= found[-1][1]:
+            return found[-1], slack
+    return found[0], PEAK
+
+
 def damping_range(
     loops: LoopsOffModel, f: Callable[[Loop], float], limits: tuple[float, float] | None = None
 ) -> tuple[float, float]:
@@ -342,17 +382,20 @@ def survival(
     omega_low: float,
     slack: float = PEAK,
     marks: Sequence[float] = (),
+    held: tuple[float, float] = (0.0, 0.0),
 ) -> Survival:
     """The figures of a loop that is stable on the model; ω_b in rad/s.
 
-    `slack`: what S_max may be exceeded by, relative; `marks`: shifts that are evaluated too, on
-    both sides.
+    `slack`: what S_max may be exceeded by, relative, on the model and from `held` to `held`;
+    `marks`: shifts that are evaluated too, on both sides.
     """
     nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
     denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
     if nominal.stable and not nominal.peak <= level:
         denied = f"a second engine finds a peak of S of {nominal.peak:.6g} on the model itself"
-    excess = partial(excess_of, level=level)
+    within, exceeded = range_within(
+        loops, partial(shift_range, loops, marks=marks), S_max, slack, held
+    )
     margins = least_margins(nominal.responses, nominal.grid())
     poles = np.linalg.eigvals(loops.controller.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
@@ -360,7 +403,7 @@ def survival(
     unstable = poles[(poles.real > size) & (poles.imag >= 0.0)]
     return Survival(
         stable_shift=shift_range(loops, growth_of, marks=marks),
-        S_max_shift=shift_range(loops, excess, marks=marks),
+        S_max_shift=within,
         stable_damping=damping_range(loops, growth_of),
         gain=(margins.gain_down, margins.gain_up),
         phase_deg=margins.phase_deg,
@@ -369,6 +412,7 @@ def survival(
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
         statics=statics(nominal.plant, loops.controller, bandwidth=bandwidth, omega_low=omega_low),
         contradiction=denied,
+        S_max_slack=exceeded,
     )
 
 

@@ -16,11 +16,11 @@ from enum import StrEnum
 from typing import Any
 
 from ccd_casadi.codesign.formulation import GlobalCheck
-from ccd_casadi.codesign.survival import Survival, SurvivalOptions
+from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.optim.kkt import Kink, KktCertificate, KktOptions
-from ccd_casadi.support.text import counted, small_share, spoken, with_unit
+from ccd_casadi.support.text import counted, inwards, small_share, spoken, with_unit
 from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
 
@@ -305,7 +305,8 @@ def survives(
     if not (low <= -options.least_shift and high >= options.least_shift):
         warned = True
         said[-1] += f", less than +-{100 * options.least_shift:g} %"
-    said.append(f"within S_max {_range(*survival.S_max_shift)}")
+    more = "" if survival.S_max_slack < STATED else f"{1.0 + survival.S_max_slack:.6g} "
+    said.append(f"within {more}S_max {_range(*survival.S_max_shift)}")
     if not (damping[0] <= options.least_factors[0] and damping[1] >= options.least_factors[1]):
         warned = True
         said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
@@ -334,6 +335,7 @@ def survives(
     figures |= {
         "stable_shift": list(survival.stable_shift),
         "S_max_shift": list(survival.S_max_shift),
+        "S_max_shift_slack": survival.S_max_slack,
         "shift_followed_to": followed.reach,
         "least_shift": options.least_shift,
         "stable_damping": list(survival.stable_damping),
@@ -375,5 +377,5 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
 
 def _range(low: float, high: float) -> str:
     beyond = [">" if abs(end) >= 0.999 * SurvivalOptions().reach else "" for end in (low, high)]
-    shown = [float(round(100.0 * end, 3)) for end in (low, high)]  # less is none
-    return f"{beyond[0]}{shown[0]:+.2g} to {beyond[1]}{shown[1]:+.2g} %"
+    shown = [inwards(100.0 * end, 2, 3) for end in (low, high)]  # less is none
+    return f"{beyond[0]}{shown[0]:+g} to {beyond[1]}{shown[1]:+g} %"

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.survival import STATED
 from ccd_casadi.drawing.content import (
     Band,
     Chapter,
@@ -27,7 +28,7 @@ from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ, number, spoken, with_unit
+from ccd_casadi.support.text import HZ, inwards, number, spoken, with_unit
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 
@@ -93,7 +94,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
 
 def _words(part: str, *known: Any) -> list[str]:
     """The paragraphs of a macro of `templates/robustness.txt`."""
-    return paragraphs(f"robustness.{part}", *known, way_words=way_words)
+    own = {"way_words": way_words, "inwards": inwards, "STATED": STATED}
+    return paragraphs(f"robustness.{part}", *known, **own)
 
 
 def _bandwidth_lost(run: FinishedRun, found: Study, *, accepted: float = 0.05) -> tuple[float, ...]:

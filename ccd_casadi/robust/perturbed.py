@@ -12,11 +12,12 @@ from scipy.optimize import brentq
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.survival import (
+    PEAK,
     LoopsOffModel,
     damping_range,
-    excess_of,
     growth_of,
     loops_off_model,
+    range_within,
     shift_range,
 )
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -169,12 +170,14 @@ class PerturbedLoop:
 class Line:
     """Plants along one perturbation, and the range around the model where the loop holds.
 
-    `stable` and `within` (S_max) are the ends, as far as the line goes, between which it does.
+    `stable` and `within` are the ends, as far as the line goes, between which it does; within
+    S_max, or `slack` more (relative).
     """
 
     judged: tuple[PerturbedLoop, ...]
     stable: tuple[float, float]
     within: tuple[float, float]
+    slack: float
 
 
 def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> PerturbedLoop:
@@ -194,9 +197,10 @@ def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Pert
 def shift_line(run: FinishedRun, reach: float, count: int = 41) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
     shifts = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
-    marks = [abs(end) for end in kind_of(run.problem).common_shifts()]
+    held = kind_of(run.problem).common_shifts()
+    marks = [abs(end) for end in held]
     places = {float(s): Perturbation(float(s)) for s in shifts}
-    return _line(run, places, 0.0, partial(shift_range, limit=reach, marks=marks),
+    return _line(run, places, 0.0, held, partial(shift_range, limit=reach, marks=marks),
                  Progress(len(places), "resonance shifts"))  # fmt: skip
 
 
@@ -204,25 +208,29 @@ def damping_line(run: FinishedRun, low: float, high: float, count: int = 41) -> 
     """Damping times d, low <= d <= high; evenly in its logarithm."""
     factors = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
     places = {float(d): Perturbation(0.0, float(d)) for d in factors}
-    return _line(run, places, 1.0, partial(damping_range, limits=(low, high)),
+    own = (1.0, *kind_of(run.problem).other_factors()[0])
+    return _line(run, places, 1.0, (min(own), max(own)), partial(damping_range, limits=(low, high)),
                  Progress(len(places), "damping"))  # fmt: skip
 
 
 def _line(
-    run: FinishedRun, places: Mapping[float, Perturbation], model: float,
+    run: FinishedRun, places: Mapping[float, Perturbation], model: float, held: Ends,
     search: Callable[[LoopsOffModel, Figure], Ends], progress: Progress,
 ) -> Line:  # fmt: skip
     """The plants at these places, and between what the loop is stable, and within S_max, by the
-    search that the verdict of a solve makes; `model`: its place, where not even there."""
+    search that the verdict of a solve makes; `model`: its place, where not even there; `held`: the
+    ends of the set's own part of the line."""
     loops = loops_off_model(run.system, run.controller, run.sampling, run.problem.suspension.free)
-    nominal, stable, within = loops.at(Perturbation()), (model, model), (model, model)
-    excess = partial(excess_of, level=run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack))
+    nominal, stable, within, slack = loops.at(Perturbation()), (model, model), (model, model), PEAK
+    held = (max(held[0], min(places)), min(held[1], max(places)))
     if nominal.stable:
         stable = search(loops, growth_of)
-        within = search(loops, excess) if excess(nominal) <= 0.0 else within
+        within, slack = range_within(
+            loops, partial(search, loops), run.problem.inner.S_max, kind_of(run.problem).slack, held
+        )
     judged = [judge(run, run.modal(off), (place,))
               for place, off in progress.over(places.items())]  # fmt: skip
-    return Line(tuple(judged), stable, within)
+    return Line(tuple(judged), stable, within, slack)
 
 
 def single_modes(run: FinishedRun, reach: float) -> tuple[PerturbedLoop, ...]:

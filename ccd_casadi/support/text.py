@@ -240,6 +240,30 @@ def told_apart(values: Sequence[float], digits: int = 4) -> list[str]:
     return found
 
 
+def inwards(value: float, digits: int, decimals: int) -> float:
+    """Round towards zero, so that the end of a range that is shown lies in the range.
+
+    Parameters
+    ----------
+    value : float
+    digits, decimals : int
+        Significant digits and decimals that are left at most.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> inwards(4.19, 2, 3), inwards(-0.0829, 2, 3), inwards(3.0 - 1e-15, 2, 2), inwards(1e-6, 2, 3)
+    (4.1, -0.082, 3.0, 0.0)
+    """
+    if value == 0.0 or not math.isfinite(value):
+        return value
+    places = min(decimals, digits - 1 - math.floor(math.log10(abs(value) * (1.0 + 1e-9))))
+    return round(math.trunc(value * (1.0 + 1e-9) * 10.0**places) / 10.0**places, max(places, 0))
+
+
 PLAIN = (".c", ".h", ".md", ".st", ".txt")  # what no mark-up is in
 
 

@@ -192,5 +192,5 @@ def test_every_range_of_a_survival_is_tried_here() -> None:
     """A new one has to be given a fault too."""
     assert {field.name for field in fields(Survival)} == {
         "stable_shift", "S_max_shift", "stable_damping", "gain", "phase_deg", "delay", "modulus",
-        "unstable_poles_hz", "statics", "contradiction",
+        "unstable_poles_hz", "statics", "contradiction", "S_max_slack",
     }  # fmt: skip

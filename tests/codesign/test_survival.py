@@ -1,6 +1,7 @@
 """What a loop survives: ranges against dense evaluations of their own, whatever is drawn."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
@@ -16,8 +17,10 @@ from ccd_casadi.codesign.survival import (
     LoopsOffModel,
     Survival,
     SurvivalOptions,
+    excess_of,
     loops_off_model,
     reach,
+    shift_range,
     survival,
 )
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
@@ -183,6 +186,26 @@ def test_no_range_hides_a_peak_or_an_instability(seed: int) -> None:
         if abs(end) < SurvivalOptions().reach:
             beyond = end * (1.0 + 3e-4) + np.sign(end) * 3e-9
             assert np.linalg.eigvals(loop(float(beyond)).A).real.max() > -1e-6
+
+
+@given(seed=st.integers(0, 10**6), loose=st.sampled_from([2e-4, 1e-2]))
+@settings(max_examples=8, deadline=None)
+def test_a_range_ends_where_s_max_does_unless_the_set_is_held_by_less(
+    seed: int, loose: float
+) -> None:
+    """A tolerance of the search adds to a range only what the set needs, and is stated then."""
+    loops, S_max = loops_and_bound(drawn(seed), seed)
+    exact, wide = (
+        shift_range(loops, partial(excess_of, level=S_max * (1.0 + slack)))
+        for slack in (PEAK, loose)
+    )
+    assume(wide[0] < exact[0] or exact[1] < wide[1])
+    known = {"S_max": S_max, "bandwidth": CROSSOVER, "omega_low": 1.0, "slack": loose}
+    for held in ((0.0, 0.0), exact, (2.0 * wide[0] - 0.1, 2.0 * wide[1] + 0.1)):
+        found = survival(loops, held=held, **known)
+        assert (found.S_max_shift, found.S_max_slack) == (exact, PEAK)
+    found = survival(loops, held=wide, **known)
+    assert (found.S_max_shift, found.S_max_slack) == (wide, loose)
 
 
 @given(seed=st.integers(0, 10**6), delay=st.floats(0.0, 1.7))

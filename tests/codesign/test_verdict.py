@@ -119,6 +119,21 @@ def test_a_narrow_range_of_resonances_is_warned(low: float, high: float) -> None
     assert line.figures["stable_shift"] == [low, high]
 
 
+@given(low=st.floats(-REACH, 0.0), high=st.floats(0.0, REACH), slack=st.floats(4e-6, 1e-2))
+def test_a_range_that_is_shown_lies_in_the_range(low: float, high: float, slack: float) -> None:
+    """An end is never rounded outwards, and a tolerance of S_max is stated."""
+    found = replace(SOUND, stable_shift=(low, high), S_max_shift=(low, high))
+    words = v.survives(found, S_max=2.0).words
+    shown = re.search(r"within S_max >?(\S+) to >?(\S+) %", words)
+    assert shown is not None
+    for end, true in zip(map(float, shown.groups()), (low, high), strict=True):
+        assert abs(end) <= 100.0 * abs(true) * (1.0 + 1e-8)
+        assert abs(end) >= 90.0 * abs(true) - 1e-3
+    loose = v.survives(replace(found, S_max_slack=slack), S_max=2.0)
+    assert f"within {1.0 + slack:.6g} S_max" in loose.words
+    assert loose.figures["S_max_shift_slack"] == slack
+
+
 def test_an_unstable_controller_a_narrow_damping_and_a_high_closer_peak_are_warned() -> None:
     for item in (
         v.survives(replace(SOUND, unstable_poles_hz=(143.0,)), S_max=2.0),

@@ -228,6 +228,8 @@ def _ranges(
 ) -> Iterator[tuple[bool, str]]:
     """Within a range the loop keeps what it says, beyond its end it does not."""
 
+    slack = line.get("S_max_shift_slack", slack)
+
     def keeps(off: Loop, share: float) -> bool:
         return off.stable and off.peak() <= S_max * (1.0 + share * slack)
 

@@ -237,7 +237,7 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
     assert len(tags.ids) == len(set(tags.ids))
     assert page.count("<figure>") == 5  # one of the move, with and without feedforward
     assert "not stable on all plants" in page
-    assert "-0.76 to +5.00" in page
+    assert "-0.75 to +5.00" in page  # rounded towards zero
     left = ["report.json", "robustness.html", "robustness.json"]
     assert sorted(p.name for p in out.iterdir()) == left
 
