@@ -149,7 +149,7 @@ PARTS = ("A", "B", "C", "D")
 OF_NAMES = {"name", "notes", "userdata", "statename", "stateunit", "statepath", "inputname",
             "inputunit", "inputgroup", "outputname", "outputunit", "outputgroup", "samplinggrid",
             "scaled", "theta", "theta_names", "theta_units"}  # fmt: skip
-SI = ("", "m", "rad", "N", "Nm")  # units of signals, without what joins their factors
+SI = ("", "m", "rad", "N", "Nm", "V", "A")  # units of signals, without what joins factors
 QUANTITIES = (("Nm", "newton metres"), ("N", "newtons"), ("rad", "radians"), ("deg", "radians"),
               ("°", "radians"), ("m", "metres"))  # fmt: skip
 DELAYS = ("InputDelay", "OutputDelay", "IODelay")
