@@ -147,6 +147,7 @@ def diagnose(
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
             here += [
+                *_driven_away(found, place),
                 *_hidden(modal, place, options),
                 *zero_findings(found, problem.inner.S_max, place),
             ]
@@ -251,9 +252,12 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
     """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
     D = np.abs(modal.D - np.diag(np.diag(modal.D)))
     coupled = (options.coupled * np.diag(modal.D).max() < D).any(axis=1)
-    w, rigid, found = modal.natural, modal.rigid, []
+    k, rigid, found = np.diag(modal.K), modal.rigid, []
+    w = np.sign(k) * np.sqrt(np.abs(k))
     # modes of one frequency, whose shapes are one space; the rigid ones are one
-    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= options.hidden * w[1:]))
+    same = (rigid[1:] & rigid[:-1]) | (
+        ~rigid[:-1] & (np.abs(np.diff(w)) <= options.hidden * np.abs(w[1:]))
+    )
     for group in np.split(np.arange(len(w)), np.flatnonzero(~same) + 1):
         if coupled[group].any():
             continue  # a damper hands its motion on to others
@@ -272,6 +276,13 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
                 "controller holds them, and they are left out of the loop; something else in the "
                 "machine has to"
             )
+        elif k[group[0]] < 0.0:
+            words = (
+                f"a motion that the stiffness drives away {place} is {missing}: no controller "
+                "stabilises it; add an actuator that moves it and a sensor that sees it"
+            )
+            found.append(Finding(Severity.ERROR, Topic.HIDDEN_MODE, words))
+            continue
         else:
             formal = {"driven": "uncontrollable", "measured": "unobservable"}
             words = (
@@ -283,11 +294,22 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
     return found
 
 
+def _driven_away(facts: PlantFacts, place: str) -> list[Finding]:
+    growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
+    if not growth:
+        return []
+    words = (
+        f"the stiffness drives a motion away {place}: an unstable pole at +{growth:.4g} Hz, which "
+        "the loop has to be faster than; if a spring was meant, correct the sign of stiffness"
+    )
+    return [Finding(Severity.NOTE, Topic.UNSTABLE, words)]
+
+
 def _rigid(
     modal: ModalPlant, suspension: Suspension, expected: int | None, place: str
 ) -> list[Finding]:
     count = int(modal.rigid.sum())
-    flexible = modal.natural[~modal.rigid] / HZ
+    flexible = modal.natural[~modal.rigid & ~modal.driven_away] / HZ
     least = f"; the lowest frequency is {flexible[0]:.4g} Hz" if flexible.size else ""
     if expected is not None and count != expected:
         words = (

@@ -79,6 +79,7 @@ class Topic(StrEnum):
     DERIVATIVES = "derivatives"
     LOOP = "loop"
     UNUSED = "unused parameter"
+    UNSTABLE = "unstable pole"
 
 
 @dataclass(frozen=True)
@@ -166,15 +167,19 @@ def loop_findings(
     words = []
     if len(modal.C) == 1 == modal.B.shape[1]:
         gains = modal.C[0] * modal.B[:, 0]
-        rigid = modal.rigid  # else at rest
-        if (gains[rigid] if rigid.any() else gains / np.diag(modal.K)).sum() < 0.0:
+        rigid, away = modal.rigid, bool(modal.driven_away.any())
+        # of a free or driven-away body as it accelerates, else at rest
+        moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
+        if moved.sum() < 0.0:
             words.append(
                 "a positive force moves the sensor to negative values, so that a controller of "
                 "positive gain is unstable: is the sign of output or input as it is wired? "
                 "If not, correct the row or the column"
             )
+    growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if (run := problem.sampling) is not None:
         words += _lag_words(run, facts.effort_hz, options)
+        words += _unstable_words(run, growth, problem.inner.S_max)
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
 
 
@@ -197,6 +202,26 @@ def _lag_words(run: Sampling, meant: float, options: FindingOptions) -> list[str
             f"some {limit:.2g} Hz, and M_K suits {meant:.3g} Hz: {hint}"
         )
     return words
+
+
+def _unstable_words(run: Sampling, growth_hz: float, S_max: float) -> list[str]:
+    """Whether a pole is too fast for the loop's delay.
+
+    At a pole p of G in the right half-plane every stable loop has T = 1. From e to y it passes no
+    less than d whole periods of delay and one of the hold, so T z^(d+1) is analytic outside the
+    unit circle, and by the maximum principle
+
+        ‖T‖∞ >= e^(p T (d + 1)),   ‖S‖∞ >= ‖T‖∞ - 1.
+    """
+    steps = int(run.delay / run.period * (1.0 + 1e-9)) + 1
+    least = np.exp(min(HZ * growth_hz * run.period * steps, 700.0)) - 1.0
+    if least <= S_max:
+        return []
+    return [
+        f"loop: the plant grows as exp(2π {growth_hz:.4g} t) and the force comes {steps} periods "
+        f"of {1e6 * run.period:.4g} us late, so that no controller has a peak of S below "
+        f"{least:.3g}; S_max is {S_max:g}: raise rate_hz, lower delay_us, or hold the plant"
+    ]
 
 
 def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:
@@ -272,7 +297,7 @@ def _effort(
 def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOptions) -> list[str]:
     """The first resonance that shows, against the bandwidth that M_K suits without resonances."""
     least = options.shown
-    shown = (m for m in facts.modes if not m.rigid and min(m.driven, m.measured) > least)
+    shown = (m for m in facts.modes if m.resonant and min(m.driven, m.measured) > least)
     first = next((mode.frequency_hz for mode in shown), np.nan)  # which compares with nothing
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
     high = _searched(problem)[1]

@@ -118,7 +118,7 @@ def size_words(
     parts = []
     if math.isfinite(facts.inertia):
         parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
-    flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
+    flexible = [mode.frequency_hz for mode in facts.modes if mode.resonant]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):
         low, high = (share * facts.effort_hz for share in options.window)
@@ -130,7 +130,7 @@ def _suitable(
     problem: CoDesignProblem, start: PlantFacts, shares: tuple[float, ...]
 ) -> list[dict[str, float]]:
     """M_K that moves `effort_hz` to shares of the first resonance, below which G falls as ω⁻²."""
-    first = next((mode.frequency_hz for mode in start.modes if not mode.rigid), math.nan)
+    first = next((mode.frequency_hz for mode in start.modes if mode.resonant), math.nan)
     M_K, effort = problem.weights.M_K, start.effort_hz
     return [
         {"bandwidth_hz": share * first, "M_K": M_K * (share * first / effort) ** 2}

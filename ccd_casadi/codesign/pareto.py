@@ -203,7 +203,7 @@ def natural_hz(run: FinishedRun) -> tuple[float, ...]:
         Hz, ascending.
     """
     modal = run.modal()
-    return tuple(float(w) / HZ for w in modal.natural[~modal.rigid])
+    return tuple(float(w) / HZ for w in modal.natural[~modal.rigid & ~modal.driven_away])
 
 
 def bandwidth_of(run: FinishedRun) -> float:

@@ -117,8 +117,8 @@ class LoopsOffModel:
         """
         k, d = np.diag(self.plant.K), np.diag(self.plant.D)
         strength = np.linalg.norm(self.plant.B, axis=1) * np.linalg.norm(self.plant.C, axis=0)
-        flexible = np.flatnonzero(~self.plant.rigid)
-        natural = np.sqrt(k)
+        flexible = np.flatnonzero(~self.plant.rigid & ~self.plant.driven_away)
+        natural = np.sqrt(np.maximum(k, 0.0))
         gain = np.linalg.norm(self.run.swept(natural[flexible]), axis=(1, 2))
         gain *= strength[flexible] / np.maximum((natural * d)[flexible], 1e-300)
         modes = flexible[gain > self.options.weak_gain]

@@ -7,6 +7,7 @@ infinite at 0 Hz: at rest it is enclosed times y².
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import factorial
 from typing import Self
 
 import numpy as np
@@ -84,6 +85,34 @@ class FrequencyAxis:
         # both times 1/z, of size one on the axis
         return -(all_of * turn) + 1.0, residue * N * inverse(p) * turn
 
+    def driven_away(self, square: Affine) -> Affine:
+        """1/(s² - q) of q = `square` > 0: real poles ±√q, which apart would cancel far above them.
+
+        With hold and delay, h = T - rest of the delay, r = T - h and z = e^{sT}, it is z⁻ᵈ⁻¹ times
+
+            (φ(h) + (2φ(T) - φ(h) - φ(r))/z + φ(r)/z²) / ((1 - 1/z)² - 2qφ(T)/z)
+
+        with φ(x) = (cosh √q x - 1)/q, a power series in q.
+        """
+        n = len(square.slope)
+        x, y = self.x.of(n), self.y.of(n)
+        if self.period is None:
+            return x * x * inverse(y * y - square * x * x)
+        T, turn = self.period, self.turn.of(n)
+        whole, rest = delay_parts(T, self.delay)
+        late, full, early = (_moved(square, time) for time in (T - rest, T, rest))
+        N = late + (full * 2.0 - late - early) * turn + early * turn * turn
+        for _ in range(whole + 1):
+            N = N * turn
+        apart = turn * -1.0 + 1.0
+        return N * inverse(apart * apart - square * full * turn * 2.0)
+
+    def driven_away_unheld(self, square: Affine) -> Affine:
+        """The same without hold and delay."""
+        n = len(square.slope)
+        s = self.s.of(n)
+        return inverse(s * s - square)
+
     @property
     def free_body(self) -> Affine:
         """1/s², or y²/s² = x² at rest; sampled y² times what hold and delay make of
@@ -120,6 +149,19 @@ class FrequencyAxis:
     def _per_y_squared(self, form: Affine) -> Affine:
         """The form itself at rest, else over y²."""
         return form if self.at_rest else form * inverse(self.y * self.y)
+
+
+def _moved(square: Affine, time: float, *, terms: int = 8, most: float = 1.0) -> Affine:
+    """φ(x) = (cosh √q x - 1)/q = x²/2 Σ 2 uⁿ/(2n + 2)!, u = q x²: how far a unit force moves the
+    body in the time x. What is left out from `terms` on is less than twice its first term where
+    |u| is at most `most`, and unknown beyond."""
+    u = square * time**2
+    total = u * 0.0 + 1.0
+    for n in range(terms - 1, 0, -1):
+        total = u * total * (1.0 / ((2 * n + 1) * (2 * n + 2))) + 1.0
+    left = 4.0 / factorial(2 * terms + 2)
+    rest = total.rest + np.where(u.size <= most, left, np.inf)
+    return Affine(total.centre, total.slope, rest) * (0.5 * time**2)
 
 
 def axis_of(

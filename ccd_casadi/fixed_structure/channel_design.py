@@ -73,8 +73,8 @@ def synthesise_sections(
     Parameters
     ----------
     plants : control.StateSpace, control.TransferFunction or ScaledPlant, or a list of them
-        Stable, force (N) to displacement (m). Give a free mass the slow suspension that it has, if
-        only of its cables.
+        Force (N) to displacement (m); stable or not. Give a free mass the slow suspension that it
+        has, if only of its cables.
     structure, bounds : Structure or ChannelStructure, Bounds
         Sections of K, and what holds on every plant.
     sampling : Sampling, optional

@@ -48,9 +48,17 @@ def discs_of(
         if plant.rigid[i]:
             gain = plant.strength(tuple(names[k] for k in own), low[own], high[own])
             gain = gain if strength is None else gain * strength
-            _fill_free(held, i, rows, axis.free_body.of(len(rows)) * gain)
+            _fill_form(held, i, rows, axis.free_body.of(len(rows)) * gain)
             if free:
-                _fill_free(bare, i, rows, axis.free_body_unheld.of(len(rows)) * gain)
+                _fill_form(bare, i, rows, axis.free_body_unheld.of(len(rows)) * gain)
+            continue
+        if plant.away[i]:
+            on = tuple(names[k] for k in own), low[own], high[own]
+            gain, (square, least) = plant.strength(*on), plant.rate_squared(i, *on)
+            damped = damped & (least > 0.0)  # one pole on each side of the axis
+            _fill_form(held, i, rows, axis.driven_away(square) * gain)
+            if free:
+                _fill_form(bare, i, rows, axis.driven_away_unheld(square) * gain)
             continue
         poles, decay = plant.poles(i, tuple(names[k] for k in own), low[own], high[own], w)
         damped = damped & (decay >= 0.0)
@@ -65,8 +73,8 @@ def discs_of(
     return held, bare if free else held, damped
 
 
-def _fill_free(discs: Discs, i: int, rows: list[int], form: Affine) -> None:
-    """A free body's disc."""
+def _fill_form(discs: Discs, i: int, rows: list[int], form: Affine) -> None:
+    """The disc of a mode that has one form."""
     discs.middle[i], discs.radius[i] = form.centre, (form.reach + form.rest) * (1.0 + 1e-12)
     discs.shares[i, rows] = form.reaches
 

@@ -8,7 +8,7 @@ For a proof it is a sum of modes, poles and residues as affine forms of what is 
 
     G(s) = Σ b_i c_i/(s² + g_i s + k_i) = Σ r_i/(s - p_i) - r_i/(s - q_i),   r = b c/(p - q)
 
-and b_i c_i/s² of free bodies.
+b_i c_i/s² of free bodies, and b_i c_i/(s² - w_i²) of what the stiffness drives away.
 """
 
 from collections.abc import Callable, Sequence
@@ -223,7 +223,8 @@ class ModalSum:
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
     `rigid` ones are free, k = g = 0, and come first; the others are in the order of
-    their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
+    their numbers. `away`: the stiffness drives it away, k = -w², g = 0, with w (1/s) in place
+    of ω. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
     over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
     """
 
@@ -233,6 +234,7 @@ class ModalSum:
     zeta: float
     drive: Array
     reading: Array
+    away: np.ndarray
     moving: Callable[[Array, Array], tuple[list[list[Affine]], np.ndarray]] | None = None
 
     def shift_of(self, i: int) -> str:
@@ -247,6 +249,18 @@ class ModalSum:
             return one
         k = names.index("gain")
         return variable(low[k], high[k], k + 1, n) + 1.0
+
+    def rate_squared(
+        self, i: int, names: tuple[str, ...], low: Array, high: Array
+    ) -> tuple[Affine, Array]:
+        """w² of a mode i that the stiffness drives away, with the variables of `poles`, and a bound
+        (N,) below w."""
+        n, m = len(low) + 1, low.shape[1]
+        w = Affine(np.full(m, self.omega[i]), np.zeros((n, m)), np.zeros(m))
+        for k, name in enumerate(names):
+            if name in ("resonance_shift", self.shift_of(i)):
+                w = w * (variable(low[k], high[k], k + 1, n) + 1.0)
+        return w * w, _least(w)
 
     def poles(
         self, i: int, names: tuple[str, ...], low: Array, high: Array, moved: Affine | None = None
@@ -280,28 +294,31 @@ def modal_sum(
     uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
 ) -> ModalSum | None:
     """None where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
-    brakes a free body. Modes that move need a graph, a damping ratio, one force, one sensor, and to
-    be apart at the model."""
+    brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
+    damping ratio, one force, one sensor, a stiffness that holds them, and to be apart at the
+    model."""
     system = uncertain.options[option]
     modal = uncertain.modal(option)
     zeta = float(system.damping_ratio or 0.0)
-    given = modal.D - np.diag(2.0 * zeta * modal.natural)
+    given, away = modal.D - np.diag(2.0 * zeta * modal.natural), modal.driven_away
+    omega = np.where(away, np.sqrt(np.abs(np.diag(modal.K))), modal.natural)
     size = np.abs(np.diag(modal.D)).max()
     if np.abs(given - np.diag(np.diag(given))).max() > uncoupled * size:
         return None
-    if given[modal.rigid].any():
+    if given[modal.rigid | away].any():
         return None
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > uncoupled * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
     found = ModalSum(
-        modal.natural[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta,
-        modal.B[order] / unit**2, modal.C.T[order],
+        omega[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta,
+        modal.B[order] / unit**2, modal.C.T[order], away[order],
     )  # fmt: skip
     if not uncertain.ranges:
         return found
     graph, one = uncertain.graph(option), np.ones((len(order), 1))
-    if graph is None or not zeta or not found.drive.shape == found.reading.shape == one.shape:
+    single = found.drive.shape == found.reading.shape == one.shape
+    if graph is None or not zeta or away.any() or not single:
         return None
     moving = partial(moving_modes, graph, int(modal.rigid.sum()), unit)
     model = uncertain.nominal[-len(uncertain.ranges) :, None]

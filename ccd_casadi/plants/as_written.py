@@ -12,6 +12,8 @@ the damping and a gain g,
 
     K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
     D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
+
+A motion that K drives away, λ_i < 0, has ω_i = 0 here: ζ damps none.
 """
 
 from collections.abc import Sequence
@@ -66,9 +68,10 @@ def as_written(
     ratio = (1.0 + shift) * (1.0 + own)
     K = (1.0 + shift) ** 2 * (system.K + (pushes * (((1.0 + own) ** 2 - 1.0) * lam)) @ pushes.T)
     zeta = system.damping_ratio or 0.0
-    D = damping * (system.D + (pushes * (2.0 * zeta * ratio * np.sqrt(lam))) @ pushes.T)
+    omega = ratio * np.sqrt(np.maximum(lam, 0.0))
+    D = damping * (system.D + (pushes * (2.0 * zeta * omega)) @ pushes.T)
     M, B, C = system.M, (1.0 + gain) * system.B, system.C
-    sides, soft = _seen(shapes, rigid, B, C), lam[~rigid]
+    sides, soft = _seen(shapes, rigid, B, C), np.abs(lam[~rigid])
     spread = bool(len(soft)) and soft.max() > stiff * soft.min()
     if sides is None and spread:
         sides = shapes, shapes

@@ -6,8 +6,10 @@ on the eigenvalues λ = ω². Their derivatives follow from divided differences,
     dh(Λ)_ij = h[λ_i, λ_j] dΛ_ij    (Daleckii and Krein),
 
 which is exact at double eigenvalues too. Rigid is what K does not resist (`rigid_modes`): poles at
-zero. On the axis they would make the mixed-sensitivity problem singular, so that a synthesis has a
-suspension that puts them at (ω_r, ζ_r). Nothing is judged with it: every loop has them `free`.
+zero. A motion that K drives away has λ < 0 and poles ±√-λ; a damping ratio says nothing of it and
+damps none. On the axis poles at zero would make the mixed-sensitivity problem singular, so that a
+synthesis has a suspension that puts them at (ω_r, ζ_r). Nothing is judged with it: every loop has
+them `free`.
 """
 
 from dataclasses import dataclass, replace
@@ -102,7 +104,7 @@ class ModalPlant:
     K, D, B, C : arrays (n, n), (n, n), (n, m), (p, n)
         Stiffness (rad²/s²), damping (rad/s), input (1/√kg) and output (1/√kg).
     natural : array (n,)
-        Natural frequencies in rad/s before the suspension.
+        Natural frequencies in rad/s before the suspension; 0 of what K does not resist.
     rigid : bool array (n,)
         Which modes are rigid-body modes.
     modes : array (N, n)
@@ -125,6 +127,11 @@ class ModalPlant:
     dC: Array
 
     @property
+    def driven_away(self) -> np.ndarray:
+        """Which modes (n,) have a negative stiffness: K drives them away."""
+        return np.asarray(np.diag(self.K) < 0.0)
+
+    @property
     def numbered(self) -> np.ndarray:
         """The flexible modes in the order of their numbers, see `numbered`."""
         return numbered(self.modes, self.rigid)
@@ -132,7 +139,7 @@ class ModalPlant:
     @property
     def state_space(self) -> StateSpace:
         """[q; q̇] in SI, velocities in units in which a mode's energy is even."""
-        n, k = len(self.K), np.diag(self.K)
+        n, k = len(self.K), np.abs(np.diag(self.K))
         scale = np.sqrt(np.where(k > 1e-12, k, 1.0))
         A = np.zeros((2 * n, 2 * n))
         A[:n, n:], A[n:, :n], A[n:, n:] = np.diag(scale), -self.K / scale, -self.D
@@ -167,12 +174,12 @@ def modal_plant(
     Raises
     ------
     PlantError
-        A stiffness is negative, or it is not known whether K resists a motion.
+        It is not known whether K resists a motion.
     """
     lam, modes, rigid = natural_modes(system.K, system.M, suspension.rigid_modes)
     w_r = 2.0 * np.pi * suspension.frequency_hz
     modes = _aligned(modes, lam, system.C, options.equal_outputs)
-    root = np.sqrt(lam)
+    root, driven_away = np.sqrt(np.abs(lam)), lam < 0.0
     own = np.zeros(rigid.size)
     shifted = numbered(modes, rigid)[: len(perturbation.modes)]
     own[shifted] = perturbation.modes[: len(shifted)]
@@ -180,6 +187,7 @@ def modal_plant(
     h = np.where(rigid, w_r**2, ratio**2 * lam)
     model = system.damping_ratio or 0.0
     zeta = model * perturbation.damping * ratio  # of the model's own root: g is a function of λ
+    zeta = np.where(driven_away, 0.0, zeta)  # of an ω: a motion that K drives away has none
     g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
 
     def to_modal(matrix: Array) -> Array:
@@ -203,7 +211,7 @@ def modal_plant(
         D=D_given + np.diag(g),
         B=modes.T @ system.B,
         C=C,
-        natural=ratio * root,
+        natural=np.where(driven_away, 0.0, ratio * root),
         rigid=rigid,
         modes=modes,
         dM=dM,
@@ -258,7 +266,8 @@ def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()
     PlantError
         The message names the frequency in Hz and the remedy.
     """
-    damping, natural, rigid = np.diag(modal.D), modal.natural, modal.rigid
+    damping, natural = np.diag(modal.D), modal.natural
+    rigid = modal.rigid | modal.driven_away  # neither has a resonance
     least = options.undamped * max(float(np.abs(damping[~rigid]).max(initial=0.0)), 1e-300)
     wrong = np.flatnonzero(~rigid & (damping <= least))
     if not wrong.size:
@@ -280,7 +289,7 @@ def _aligned(modes: Array, lam: Array, C: Array, equal: float) -> Array:
     measured alike, as tip and tilt of a square stage, there is nothing to part, and they stay.
     """
     modes = modes.copy()
-    apart = np.flatnonzero(np.diff(lam) > 1e-9 * lam[1:]) + 1
+    apart = np.flatnonzero(np.abs(np.diff(lam)) > 1e-9 * np.abs(lam[1:])) + 1
     for start, end in pairwise([0, *apart, lam.size]):
         if end - start > 1:
             seen, Vh = np.linalg.svd(C @ modes[:, start:end])[1:]
@@ -292,7 +301,7 @@ def _aligned(modes: Array, lam: Array, C: Array, equal: float) -> Array:
 def _divided_differences(lam: Array, values: Array, rigid: np.ndarray, slope: Array) -> Array:
     """h[λ_i, λ_j]; among rigid modes zero, since they stay rigid at every θ."""
     gap = lam[:, None] - lam[None, :]
-    close = np.abs(gap) <= 1e-9 * np.maximum(lam[:, None], lam[None, :])
+    close = np.abs(gap) <= 1e-9 * np.maximum(np.abs(lam[:, None]), np.abs(lam[None, :]))
     safe = np.where(close, 1.0, gap)
     mean_slope = 0.5 * (slope[:, None] + slope[None, :])
     out = np.where(close, mean_slope, (values[:, None] - values[None, :]) / safe)

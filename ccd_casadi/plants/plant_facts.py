@@ -22,13 +22,22 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class PlantMode:
-    """One mode of the undamped plant; driven and measured: its gains over the largest."""
+    """One mode of the undamped plant; driven and measured: its gains over the largest.
+
+    Where the stiffness drives it away it has no resonance and grows as exp(2π `growth_hz` t).
+    """
 
     frequency_hz: float
     damping_ratio: float
     rigid: bool
     driven: float
     measured: float
+    growth_hz: float = 0.0
+
+    @property
+    def resonant(self) -> bool:
+        """Whether K resists it."""
+        return not self.rigid and not self.growth_hz
 
 
 @dataclass(frozen=True)
@@ -110,9 +119,12 @@ def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
     """
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
-    zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.where(modal.rigid, 1.0, np.diag(modal.K))))
-    zeta = np.where(modal.rigid, 0.0, zeta)
-    columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max())
+    k, d = np.diag(modal.K), np.diag(modal.D)
+    resonant = ~modal.rigid & (k > 0.0)
+    zeta = np.where(resonant, d / (2.0 * np.sqrt(np.where(resonant, k, 1.0))), 0.0)
+    away = np.minimum(k, 0.0)  # s² + d s + k = 0
+    growth = np.where(away < 0.0, np.sqrt(0.25 * d**2 - away) - 0.5 * d, 0.0) / HZ
+    columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max(), growth)
     return tuple(map(PlantMode, *(column.tolist() for column in columns)))
 
 

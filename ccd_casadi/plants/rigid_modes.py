@@ -10,6 +10,9 @@ which no unit of a coordinate changes: entries of K with relative errors ε move
 K' by n ε. So K' resists a motion by what it has there, or by rounding. What lies between is
 refused unless the case states how many rigid-body modes there are.
 
+A negative eigenvalue is a motion that K drives away, as the negative stiffness of a magnetic
+bearing does: λ < 0, and poles ±√-λ where nothing damps it. It is no rigid-body mode.
+
 Flexible modes are those of the M-orthogonal complement, low ones by the inverse where stiffnesses
 are many decades apart: an eigenvalue solver errs by ε of its largest eigenvalue.
 """
@@ -62,29 +65,28 @@ def natural_modes(
     K, M : arrays (n, n)
         Stiffness and mass, symmetric, M positive definite, SI.
     stated : int, optional
-        How many rigid-body modes the case states: where K leaves it open the lowest ones are.
+        How many rigid-body modes the case states: where K leaves it open those of least |λ| are.
     options : RigidModeOptions
 
     Returns
     -------
     λ (n,), Φ (n, n), rigid (n,)
+        Rigid ones first.
 
     Raises
     ------
     PlantError
-        K has a negative eigenvalue, or one that is neither zero nor known.
+        K has an eigenvalue that is neither zero nor known.
     """
-    diagonal = np.diag(K)
-    if (diagonal < 0.0).any():
-        raise _negative()
+    diagonal = np.abs(np.diag(K))
     d = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     w, U = np.linalg.eigh(K / d[:, None] / d)
+    order = np.argsort(np.abs(w), kind="stable")
+    w, U = np.abs(w[order]), U[:, order]
     rounding = options.rounding * len(K) * EPS
     count = int((w <= rounding).sum())
     if stated is not None and count <= stated < len(w):
         count = stated if w[:stated].max(initial=0.0) <= options.stated else count
-    if w[0] < -(rounding if stated is None else options.stated):
-        raise _negative()
     open_ones = w[count:] < options.known
     if open_ones.any() and count != stated:
         raise PlantError(
@@ -99,7 +101,7 @@ def natural_modes(
     own, rest = Q[:, :count], Q[:, count:]
     lam, shapes = np.linalg.eigh(rest.T @ (0.5 * (A + A.T)) @ rest)
     modes = np.linalg.solve(L.T, np.hstack([own, rest @ shapes]))
-    if len(lam) and lam[-1] > options.stiff * lam[0]:
+    if len(lam) and lam[-1] > options.stiff * lam[0] > 0.0:
         lam, modes[:, count:] = _low_ones_by_the_inverse(K, M, lam, modes, count)
     return np.append(np.zeros(count), lam), modes, np.arange(len(K)) < count
 
@@ -197,7 +199,3 @@ def _low_ones_by_the_inverse(
     low, found = 1.0 / inverse[flexible], shapes[:, flexible] / np.sqrt(inverse[flexible])
     fine = low < np.sqrt(lam[-1] * low[0])
     return np.where(fine, low, lam), np.where(fine, found, modes[:, count:])
-
-
-def _negative() -> PlantError:
-    return PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")

@@ -276,7 +276,7 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     drive = M_K / omega_0**2
     # Stretch x1 = s q so that ẋ1 = s x2 and ẋ2 = -(K/s) x1 weigh alike; mode sizes by a, so
     # that each mode is driven as strongly as it is measured.
-    s = np.maximum(np.sqrt(np.diag(K)), 1.0)
+    s = np.maximum(np.sqrt(np.abs(np.diag(K))), 1.0)
     both = (b > 1e-12 * b.max()) & (c > 1e-12 * c.max())
     a = np.sqrt(np.divide(drive * b * s, c, out=np.ones_like(b), where=both))
     n, m, p = K.shape[0], modal.B.shape[1], modal.C.shape[0]

@@ -125,9 +125,10 @@ def modes_table(modal: ModalPlant) -> Table:
     shares of the largest of all modes."""
     rows = []
     for mode in sorted(modes_of(modal), key=lambda mode: mode.frequency_hz):
-        known = ("rigid", "") if mode.rigid else (
-            f"{number(mode.frequency_hz, 4)}\u00a0Hz", f"{100.0 * mode.damping_ratio:.3g} %"
-        )  # fmt: skip
+        known = (f"{number(mode.frequency_hz, 4)}\u00a0Hz", f"{100.0 * mode.damping_ratio:.3g} %")
+        if not mode.resonant:
+            grows = f"driven away, pole at +{number(mode.growth_hz, 4)}\u00a0Hz"
+            known = ("rigid" if mode.rigid else grows, "")
         rows.append((*known, f"{mode.driven:.2g}", f"{mode.measured:.2g}"))
     return Table(("mode", "damping", "driven (most: 1)", "measured (most: 1)"), tuple(rows))
 

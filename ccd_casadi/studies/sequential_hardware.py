@@ -59,7 +59,7 @@ def first_resonance(
     """
     system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
     modal = modal_plant(system, problem.suspension.free)
-    flexible = np.flatnonzero(~modal.rigid)
+    flexible = np.flatnonzero(~modal.rigid & ~modal.driven_away)
     if flexible.size == 0:
         return np.nan, np.full(len(theta), np.nan)
     i = int(flexible[0])
