@@ -9,7 +9,7 @@ from typing import Any
 from ccd_casadi.cases.budget import error_budget, places_of
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
-from ccd_casadi.cases.controller_tables import motion_problem
+from ccd_casadi.cases.controller_tables import filters_of, motion_problem
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
 from ccd_casadi.cases.tables import Case, RobustTable
@@ -19,6 +19,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.inner_problem.structured_bandwidth import require_motion
 from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
+from ccd_casadi.lti.wiring import Wiring
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
@@ -76,6 +77,7 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
             places=places_of(case.places),
+            wiring=Wiring(filters_of(case.actuator), filters_of(case.sensor)),
             given=given,
         ).pinned(),
         names=tuple(p.name for p in case.theta),

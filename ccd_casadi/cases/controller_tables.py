@@ -9,6 +9,7 @@ from ccd_casadi.analysis.motor_cycle import Motion, Motor
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
+from ccd_casadi.lti.wiring import Filters
 
 Numbers = float | tuple[float, ...] | None
 OF_A_MOTOR = ("force_constant", "resistance", "peak_current", "moving_mass")
@@ -84,6 +85,33 @@ def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail
     if len(mass) > 1 and not mass[0] <= least <= most <= mass[-1]:
         words = f"reaches beyond the catalogue's moving masses {mass[0]:g} to {mass[-1]:g}"
         raise fail(f"theta.{motor.size}", f"{words}; narrow it")
+
+
+def check_filters(tables: Mapping[str, Any], fail: Fail) -> None:
+    """Raise where [actuator] or [sensor] is not known together with another table."""
+    inner, budget = tables["inner"], tables["budget"]
+    given = [name for name in ("actuator", "sensor") if filters_of(tables[name])]
+    for name in ("actuator", "sensor"):
+        table = tables[name]
+        if table.damping != FiltersTable().damping and table.second_order_hz is None:
+            raise fail(f"{name}.damping", "has no effect without second_order_hz; give that")
+    if not given:
+        return
+    alone = "of the mechanics, which an actuator and a sensor are not part of; drop one of the two"
+    sources = any(getattr(budget, item.name) for item in fields(budget) if item.name != "window_ms")
+    others = (("move", tables["move"] != MoveTable()), ("budget", sources),
+              ("inner.compliance_max", inner.compliance_max is not None))  # fmt: skip
+    for key_of, there in others:
+        if there:
+            raise fail(
+                key_of, f"is beside [{given[0]}]: forces and moves are judged as those {alone}"
+            )
+
+
+def filters_of(table: "FiltersTable") -> Filters:
+    """[actuator] or [sensor] as filters."""
+    second = _listed(table.second_order_hz)
+    return Filters(_listed(table.lag_hz), second, _listed(table.damping) if second else ())
 
 
 def motion_problem(
@@ -205,6 +233,18 @@ class LoopTable:
         0.0,
         check=checks.number(0.0, 1e6, "give 0 to 1e6", closed=True),
     )
+
+
+@dataclass(frozen=True)
+class FiltersTable:
+    """[actuator] before the forces, [sensor] behind the sensors: low passes, one or one of each
+    channel."""
+
+    lag_hz: Numbers = key("corner of first order, of static gain 1", None, check=one_or_more)
+    second_order_hz: Numbers = key(
+        "natural frequency of second order, of static gain 1", None, check=one_or_more
+    )
+    damping: Numbers = key("damping ratio of second_order_hz", 0.7, check=one_or_more)
 
 
 @dataclass(frozen=True)

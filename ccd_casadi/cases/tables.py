@@ -331,7 +331,8 @@ class Case(NotebookHtml):
     plant : PlantTable
     theta, fixed : tuples of Parameter
         Searched parameters; fixed ones and those that vary.
-    objective, weights, inner, suspension, places, robust, controller, loop, budget : tables
+    objective, weights, inner, suspension, places, robust, controller, loop : tables
+    actuator, sensor, budget : tables
     sampling, outer, baseline, limits, motor, move, units : tables
         Of the same names, in units of the file.
     """
@@ -347,6 +348,8 @@ class Case(NotebookHtml):
     robust: RobustTable
     controller: controller_tables.ControllerTable
     loop: controller_tables.LoopTable
+    actuator: controller_tables.FiltersTable
+    sensor: controller_tables.FiltersTable
     budget: BudgetTable
     sampling: controller_tables.SamplingTable
     outer: controller_tables.OuterTable

@@ -159,10 +159,12 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
     NOT_MODAL = "the plant is not modal: its damping couples the modes, or brakes a free body"
+    WIRED = "an actuator or a sensor has dynamics, so the set was searched"
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
 
 
-NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.VARIES)
+NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.WIRED,
+                  ProofOutcome.VARIES)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -320,6 +322,8 @@ def prove(
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
+    if any(option.wiring for option in uncertain.options):
+        return Proof(ProofOutcome.WIRED, slack, names)
     families = []
     for option in range(len(models)):
         plant = modal_sum(uncertain, option, unit)

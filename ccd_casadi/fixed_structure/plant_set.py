@@ -12,7 +12,8 @@ coordinates of the channels first. There may be more inputs than outputs: two ac
 sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2. One channel has U = V = 1.
 
 Free bodies stay free: their poles are exactly 0, of a body that nothing damps twice, q̇ = s v and
-v̇ = b u. Such a pair of states is one of N, A = V diag(poles) W + N, N² = 0.
+v̇ = b u. Such a pair of states is one of N, A = V diag(poles) W + N, N² = 0. Behind an actuator the
+force drives q, too, and a sensor reads v.
 
 Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
 """
@@ -68,6 +69,12 @@ class LoopPlant:
         N = np.zeros_like(self.system.A)
         N[q, v] = self.system.A[q, v]
         return N
+
+    @property
+    def wired_bodies(self) -> bool:
+        """Whether a force drives the position of a free body, or a sensor reads its velocity."""
+        q, v = self.chains.T
+        return bool(self.drive[q].any() or self.reading[:, v].any())
 
     @property
     def free_bodies(self) -> np.ndarray:
@@ -180,7 +187,9 @@ class PlantSet:
         """What the kernels need for derivatives to θ; the shorter plants with zeros."""
         C, B, *parts = (padded([getattr(plant, name) for plant in self.plants], dtype=complex)
                         for name in ("reading", "drive", "dA", "dB", "dC"))  # fmt: skip
-        kinds = np.full(self.poles.shape, modes.SIMPLE, np.int8)
+        poles, kinds = self.poles, np.full(self.poles.shape, modes.SIMPLE, np.int8)
+        if any(plant.wired_bodies for plant in self.plants):
+            poles, kinds, C, B, parts = self._with_integrators(poles, kinds, C, B, parts)
         for i, plant in enumerate(self.plants):
             q, v = plant.chains.T
             kinds[i, q], kinds[i, v] = modes.POSITION, modes.VELOCITY
@@ -188,17 +197,45 @@ class PlantSet:
             C[i, :, v], C[i, :, q] = s[:, None] * C[i, :, q], 0.0
             B[i, q] = s[:, None] * B[i, v]
         dA, dB, dC = (np.ascontiguousarray(np.moveaxis(part, 1, -1)) for part in parts)
-        gap, size = self.poles[:, :, None] - self.poles[:, None, :], np.abs(self.poles)
+        gap, size = poles[:, :, None] - poles[:, None, :], np.abs(poles)
         # closer ones count as equal: their divided difference is a derivative
         near = np.abs(gap) <= 1e-6 * np.maximum(size[:, :, None], size[:, None, :])
         gaps = np.where(near, 0.0, 1.0 / np.where(near, 1.0, gap))
-        terms, d = np.stack([self.poles] * 6, axis=-1), 0.0
+        terms, d = np.stack([poles] * 6, axis=-1), 0.0
         if self.period is not None:
-            T, (d, late, early) = self.period, moments(self.poles, self.period, self.delay)
-            steeper = moment_slopes(self.poles, T, self.delay)
-            terms[..., 1:] = np.stack([late, early, np.exp(self.poles * T), *steeper], axis=-1)
+            T, (d, late, early) = self.period, moments(poles, self.period, self.delay)
+            steeper = moment_slopes(poles, T, self.delay)
+            terms[..., 1:] = np.stack([late, early, np.exp(poles * T), *steeper], axis=-1)
         both = np.stack([dA.real, dA.imag], axis=3)
         return PlantSlopes(terms, C, B, gaps, both, dB, dC, self.period or 0.0, d, kinds)
+
+    def _with_integrators(
+        self, poles: np.ndarray, kinds: np.ndarray, C: np.ndarray, B: np.ndarray,
+        parts: list[np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:  # fmt: skip
+        """The same with what 1/s adds to 1/s² of bodies behind actuators or sensors, as states.
+
+        The kernels take C(s - A)⁻¹ at v for C_q/s² and (s - A)⁻¹B at q for B_v/s². What is left,
+        C_v/s and B_q/s, is of two states with the pole 0: v' has the row of ∂A and ∂B at v, q' the
+        column of ∂A and ∂C at q.
+        """
+        most = max(len(plant.chains) for plant in self.plants)
+        width = [(0, 0), (0, 2 * most)]
+        poles, kinds = np.pad(poles, width), np.pad(kinds, width, constant_values=modes.SIMPLE)
+        C, B = np.pad(C, [(0, 0), *width]), np.pad(B, [*width, (0, 0)])
+        dA, dB, dC = parts
+        dA = np.pad(dA, [(0, 0), (0, 0), width[1], width[1]])
+        dB, dC = (
+            np.pad(dB, [(0, 0), (0, 0), width[1], (0, 0)]),
+            np.pad(dC, [(0, 0), (0, 0), *width]),
+        )
+        for i, plant in enumerate(self.plants):
+            n, (q, v) = self.poles.shape[1], plant.chains.T
+            rate, place = n + np.arange(len(v)), n + most + np.arange(len(q))
+            C[i][:, rate], B[i, place] = C[i][:, v], B[i, q]
+            dA[i][:, rate], dB[i][:, rate] = dA[i][:, v], dB[i][:, v]
+            dA[i][:, :, place], dC[i][:, :, place] = dA[i][:, :, q], dC[i][:, :, q]
+        return poles, kinds, C, B, [dA, dB, dC]
 
 
 def plant_set(

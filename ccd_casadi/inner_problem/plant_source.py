@@ -14,8 +14,9 @@ from typing import Any
 
 from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor_cycle import Motion
+from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.plants.differenced import user_plant
-from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed
+from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed, with_wiring
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import model_named
@@ -177,6 +178,8 @@ class PlantSource:
         Positions of its forces and sensors, if these are not at nodes.
     motion : Motion or None
         The move that it is for, and its motors.
+    wiring : Wiring
+        What lies before its forces and behind its sensors.
     given : GivenFunction or None
         A function of a program, whose `content` the program states.
     """
@@ -190,6 +193,7 @@ class PlantSource:
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
     motion: Motion | None = None
+    wiring: Wiring = UNWIRED
     given: GivenFunction | None = field(default=None, compare=False)
 
     @property
@@ -233,6 +237,7 @@ class PlantSource:
             **({"fixed": self.held} if self.fixed else {}),
             **({"places": self.places.identity} if self.places else {}),
             **({"motion": repr(self.motion)} if self.motion else {}),
+            **({"wiring": repr(self.wiring)} if self.wiring else {}),
         }
 
 
@@ -255,7 +260,7 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
     """
     if source.model is None:
         require_user_code(source.name)
-    elif source.motion is None and source.places is None:
+    elif source.motion is None and source.places is None and not source.wiring:
         lower = upper = ()  # a shipped model is the same in any box
     return _built(source.pinned(), names, lower, upper)
 
@@ -263,6 +268,9 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
 @lru_cache(maxsize=24)
 def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     """By its move, its places or its fixed parameters from the plant below."""
+    if source.wiring:
+        plant = plant_from(replace(source, wiring=UNWIRED), names, lower, upper)
+        return with_wiring(plant, source.wiring)
     if source.motion is not None:
         motion = source.motion
         size = () if motion.motor is None else (motion.motor.size,)

@@ -3,9 +3,10 @@
     M q̈ + D q̇ + K q = B u,   y = C q;   ẋ = [0 1; -M⁻¹K -M⁻¹D] x + [0; M⁻¹B] u,   x = (q, q̇)
 
 in the person's own coordinates and units, free bodies free, nothing reduced, scaled or put in modal
-form, but for one case: beside a link so stiff that λ_max > 1e7 λ_min the eigenvalues of A err by
-ε λ_max in squares of rates, which moves the soft poles and hides free bodies. There x = (η, η̇),
-q = Φ η with `natural_modes`, which know the soft modes, M = 1 and K = Λ.
+form, with its actuators and sensors around it, but for one case: beside a link so stiff that
+λ_max > 1e7 λ_min the eigenvalues of A err by ε λ_max in squares of rates, which moves the soft
+poles and hides free bodies. There x = (η, η̇), q = Φ η with `natural_modes`, which know the soft
+modes, M = 1 and K = Λ.
 
 Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d of
 the damping and a gain g,
@@ -89,7 +90,8 @@ def as_written(
     A[:n, n:] = np.eye(n)
     A[n:] = -rates[:, : 2 * n]
     drive = np.vstack([np.zeros_like(B), rates[:, 2 * n :]])
-    return strictly_proper(A, drive, np.hstack([C, np.zeros_like(C)]))
+    plant = strictly_proper(A, drive, np.hstack([C, np.zeros_like(C)]))
+    return system.wiring.around(plant)
 
 
 def _seen(shapes: Array, rigid: np.ndarray, B: Array, C: Array) -> tuple[Array, Array] | None:

@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.lti.wiring import Wiring
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 
 
@@ -128,3 +129,33 @@ def reparametrised(
         "drawing": drawing and (lambda thetas: drawing({k: own(v) for k, v in thetas.items()})),
     }
     return replace(plant, **(seen | others))
+
+
+def with_wiring(plant: Plant, wiring: Wiring) -> Plant:
+    """Give a plant its actuators and sensors.
+
+    Parameters
+    ----------
+    plant : Plant
+    wiring : Wiring
+
+    Returns
+    -------
+    Plant
+        Of the same θ, whose matrices are the mechanics' own.
+
+    Raises
+    ------
+    PlantError
+        A list has another number of entries than the plant has channels.
+    """
+    wiring.actuator.system(plant.inputs, "actuator")
+    wiring.sensor.system(plant.outputs, "sensor")
+
+    def of(evaluate: Evaluate) -> Evaluate:
+        return lambda theta: replace(evaluate(theta), wiring=wiring)
+
+    return reparametrised(
+        plant, of, lambda theta: tuple(map(float, theta)),
+        notes=lambda theta: (*plant.notes(theta), wiring.words),
+    )  # fmt: skip

@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered, placed
 from ccd_casadi.support.arrays import Array
@@ -111,6 +112,8 @@ class ModalPlant:
         Mode shapes as columns.
     dM, dK, dD, dB, dC : arrays
         Derivatives to θ, leading axis θ.
+    wiring : Wiring
+        What lies before the forces and behind the sensors.
     """
 
     K: Array
@@ -125,6 +128,7 @@ class ModalPlant:
     dD: Array
     dB: Array
     dC: Array
+    wiring: Wiring = UNWIRED
 
     @property
     def driven_away(self) -> np.ndarray:
@@ -138,14 +142,14 @@ class ModalPlant:
 
     @property
     def state_space(self) -> StateSpace:
-        """[q; q̇] in SI, velocities in units in which a mode's energy is even."""
+        """[q; q̇] in SI, velocities in units in which a mode's energy is even, as it is wired."""
         n, k = len(self.K), np.abs(np.diag(self.K))
         scale = np.sqrt(np.where(k > 1e-12, k, 1.0))
         A = np.zeros((2 * n, 2 * n))
         A[:n, n:], A[n:, :n], A[n:, n:] = np.diag(scale), -self.K / scale, -self.D
         B = np.vstack([np.zeros_like(self.B), self.B])
         C = np.hstack([self.C / scale, np.zeros_like(self.C)])
-        return strictly_proper(A, B, C)
+        return self.wiring.around(strictly_proper(A, B, C))
 
 
 def modal_plant(
@@ -219,6 +223,7 @@ def modal_plant(
         dD=perturbation.damping * to_modal(dD) + dg,
         dB=modes.T @ dB,
         dC=dC @ modes,
+        wiring=system.wiring,
     )
 
 

@@ -8,7 +8,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.svg import ModeShapes
+from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.user_code import raised_in_user_code
@@ -62,6 +63,8 @@ class Mechanics:
         Modal damping ratio of every flexible mode, from which D is made later; D is then zero.
     derivatives : tuple of arrays
         ∂M, ∂D, ∂K, ∂B, ∂C with a leading axis over θ.
+    wiring : Wiring
+        What lies before the forces and behind the sensors.
     """
 
     M: Array
@@ -71,6 +74,7 @@ class Mechanics:
     C: Array
     damping_ratio: float | None
     derivatives: tuple[Array, Array, Array, Array, Array]
+    wiring: Wiring = UNWIRED
 
     @property
     def matrices(self) -> tuple[Array, Array, Array, Array, Array]:
@@ -95,7 +99,7 @@ def to_first_order(system: Mechanics, step: Array) -> Mechanics:
     """
     pairs = zip(system.matrices, system.derivatives, strict=True)
     M, D, K, B, C = (matrix + np.tensordot(step, slopes, 1) for matrix, slopes in pairs)
-    return Mechanics(M, D, K, B, C, system.damping_ratio, system.derivatives)
+    return replace(system, M=M, D=D, K=K, B=B, C=C)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import scipy
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.state_space import StateSpace, balanced, strictly_proper
+from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -298,11 +299,16 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     dA[:, n:, n:] = -lower(modal.dD / omega_0 - modal.dM @ D)
     dB[:, n:] = left[:, None] * drive * (modal.dB - modal.dM @ modal.B)
     dC[:, :, :n] = modal.dC * right / s
+    if modal.wiring:
+        plant, slopes = strictly_proper(A, B, C), Slopes(dA, dB, dC)
+        plant, (dA, dB, dC) = modal.wiring.states(plant, slopes, omega_0)
+        A, B, C = plant.A, plant.B, plant.C
     if bare:
         none = np.empty(0)
         return ScaledPlant(A, B, C, omega_0, M_K, none, none, modal.natural, dA, dB, dC)
     grid, gain = _gains(A, B, C)
-    channels = _scaled_channels(find_channels(modal.K, modal.D, modal.B, modal.C), A, B, C)
+    apart = () if modal.wiring else find_channels(modal.K, modal.D, modal.B, modal.C)
+    channels = _scaled_channels(apart, A, B, C)
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ccd_casadi.kernels.certified_design import judge
 from ccd_casadi.kernels.sensitivity import Column
-from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop
+from ccd_casadi.lti.state_space import StateSpace, balanced, equivalent_open_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import (
@@ -221,7 +221,8 @@ def measure(
     row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Column.LIMITED_BY_BOUND] = 0.0
     K = controller.in_units(w0, plant.force)
-    A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
+    # what rounding may move the loop's poles by grows with the entries: sections are not balanced
+    A, B, C, D = *balanced(K.A, K.B, K.C), np.ascontiguousarray(K.D)
     level = CertificateOptions().unbounded if gamma is None else gamma
     judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, level,
           omega_low / w0, row)  # fmt: skip

@@ -1,14 +1,14 @@
 """Plants that their stiffness drives away: derivatives, designs, proofs, and what is impossible.
 
-The judge here steps the person's matrices through hold and delay by matrix exponentials and K by
-its difference equation, and finds the sampled loop's poles and |S| at the instants.
+The judge is `oracles.sampled_loop`.
 """
 
 from functools import cache
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve
+from oracles.sampled_loop import sampled_loop
+from scipy.linalg import solve
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -57,40 +57,16 @@ def designed(mode_hz: float | None) -> SectionsDesign:
     return found
 
 
-def sampled_loop(system: Mechanics, design: SectionsDesign) -> tuple[float, np.ndarray, np.ndarray]:
-    """Spectral radius, ω (rad/s) and |S|, of M, D, K with the force of two periods before."""
-    M, D, K, B, C = system.matrices
-    n, T = len(M), RUN.period
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [-solve(M, K), -solve(M, D)]])
-    drive = np.vstack([np.zeros_like(B), solve(M, B)])
-    held = expm(np.block([[A, drive], [np.zeros((1, 2 * n + 1))]]) * T)
-    Ad, Bd, Cd = held[: 2 * n, : 2 * n], held[: 2 * n, 2 * n :], np.hstack([C, 0.0 * C])
-    k = design.controller
-    assert k is not None
-    m = len(k.A)
-    left = np.linalg.inv(np.eye(m) - 0.5 * T * k.A)
-    a, b = left @ (np.eye(m) + 0.5 * T * k.A), left @ k.B * T
-    c, d = k.C @ left, k.D + 0.5 * T * k.C @ left @ k.B
-    size = 2 * n + 1 + m  # plant, the force that waits, controller
-    loop = np.zeros((size, size))
-    loop[: 2 * n, : 2 * n], loop[: 2 * n, 2 * n : 2 * n + 1] = Ad, Bd
-    loop[2 * n, : 2 * n], loop[2 * n, 2 * n + 1 :] = -d @ Cd, c
-    loop[2 * n + 1 :, : 2 * n], loop[2 * n + 1 :, 2 * n + 1 :] = -b @ Cd, a
-    omega = np.geomspace(0.1, np.pi / T, 4000)
-    z = np.exp(1j * omega * T)
-    G = np.array([(Cd @ solve(x * np.eye(2 * n) - Ad, Bd + 0j))[0, 0] / x for x in z])
-    R = np.array([(c @ solve(x * np.eye(m) - a, b + 0j) + d)[0, 0] for x in z])
-    return float(np.abs(np.linalg.eigvals(loop)).max()), omega, np.abs(1.0 / (1.0 + G * R))
-
-
 @pytest.mark.parametrize("mode_hz", [None, 600.0])
 def test_a_levitated_body_is_held_on_its_whole_set(mode_hz: float | None) -> None:
     design, rng = designed(mode_hz), np.random.default_rng(1)
     for shift, gain in rng.uniform(-1.0, 1.0, (12, 2)) * [0.05, 0.1]:
         own = levitated(60.0, mode_hz)
         M, D, K, B, C = own.matrices
-        off = Mechanics(M, D, (1.0 + shift) ** 2 * K, (1.0 + gain) * B, C, None, own.derivatives)
-        radius, omega, S = sampled_loop(off, design)
+        A = np.block([[0.0 * M, np.eye(len(M))], [-solve(M, (1.0 + shift) ** 2 * K), -solve(M, D)]])
+        drive = np.vstack([0.0 * B, (1.0 + gain) * solve(M, B)])
+        assert design.controller is not None
+        radius, omega, S = sampled_loop(A, drive, np.hstack([C, 0.0 * C]), design.controller, RUN)
         assert radius < 1.0
         assert S.max() <= BOUNDS.S_max * (1.0 + 2e-3)  # corners were designed on, not the inside
         assert np.interp(BOUNDS.omega_low, omega, S) <= BOUNDS.S_low * (1.0 + 2e-3)

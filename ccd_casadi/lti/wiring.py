@@ -1,0 +1,179 @@
+"""What lies between a controller and the mechanics: amplifiers before, filters behind them.
+
+Each input has an actuator a_j(s) and each output a sensor c_i(s), of static gain 1,
+
+    y = diag(c_i) C (M s² + D s + K)⁻¹ B diag(a_j) u,
+    a, c = 1/(1 + s/ω₁) · 1/(1 + 2ζ s/ω₂ + (s/ω₂)²)      either factor, both or none,
+
+in the loop of every search, figure, judge and deployed controller, exact at the instants behind a
+hold. So a force that GS speaks of enters before the actuator, and positions are as measured.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag, solve_sylvester
+
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+HZ = 2.0 * np.pi
+
+
+class Slopes(NamedTuple):
+    """∂A, ∂B, ∂C with a leading axis over θ."""
+
+    dA: Array
+    dB: Array
+    dC: Array
+
+
+@dataclass(frozen=True)
+class Filters:
+    """The low passes of the inputs, or of the outputs; each tuple has one entry, or one for each.
+
+    Attributes
+    ----------
+    lag_hz : tuple of float
+        Corners ω₁/2π of first order; empty: none.
+    second_order_hz, damping : tuple of float
+        ω₂/2π and ζ; empty: none.
+    """
+
+    lag_hz: tuple[float, ...] = ()
+    second_order_hz: tuple[float, ...] = ()
+    damping: tuple[float, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.lag_hz or self.second_order_hz)
+
+    @property
+    def words(self) -> str:
+        """Such as `1st order 2000 Hz, 2nd order 5000 Hz`."""
+        orders = (("1st order", self.lag_hz), ("2nd order", self.second_order_hz))
+        found = [f"{name} {', '.join(f'{hz:g}' for hz in given)} Hz"
+                 for name, given in orders if given]  # fmt: skip
+        return ", ".join(found)
+
+    def system(self, channels: int, key: str) -> StateSpace:
+        """The diagonal system (channels x channels), in rad/s. Raises PlantError where a list has
+        another number of entries."""
+        parts = []
+        for i in range(channels):
+            A, B, C, D = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1)
+            own = StateSpace(A, B, C, D)
+            if self.lag_hz:
+                w = HZ * _entry(self.lag_hz, i, channels, f"{key}.lag_hz")
+                own = own.series(StateSpace(*map(np.atleast_2d, (-w, w, 1.0, 0.0))))
+            if self.second_order_hz:
+                w = HZ * _entry(self.second_order_hz, i, channels, f"{key}.second_order_hz")
+                zeta = _entry(self.damping, i, channels, f"{key}.damping")
+                A = np.array([[0.0, w], [-w, -2.0 * zeta * w]])
+                B, C = np.array([[0.0], [w]]), np.array([[1.0, 0.0]])
+                own = own.series(StateSpace(A, B, C, np.zeros((1, 1))))
+            parts.append(own)
+        return StateSpace(*(block_diag(*(getattr(one, name) for one in parts)) for name in "ABCD"))
+
+
+def _entry(values: tuple[float, ...], i: int, channels: int, key: str) -> float:
+    if len(values) not in (1, channels):
+        raise PlantError(f"{key} has {len(values)} entries for {channels} channels; give one, or "
+                         "one for each")  # fmt: skip
+    return values[i % len(values)]
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """The actuators and the sensors of a plant."""
+
+    actuator: Filters = Filters()
+    sensor: Filters = Filters()
+
+    def __bool__(self) -> bool:
+        return bool(self.actuator or self.sensor)
+
+    @property
+    def words(self) -> str:
+        """What a reader of figures must know."""
+        both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
+        there = [f"{name} {own.words}" for name, own in both if own]
+        return f"{' and '.join(there)} in every loop; forces of GS and of steps enter before it"
+
+    def around(self, plant: StateSpace) -> StateSpace:
+        """The plant (p x m, time in s) with its actuators and sensors."""
+        p, m = len(plant.C), plant.B.shape[1]
+        wired = self.actuator.system(m, "actuator").series(plant)
+        return wired.series(self.sensor.system(p, "sensor"))
+
+    def states(self, plant: StateSpace, slopes: Slopes, rate: float) -> tuple[StateSpace, Slopes]:
+        """The same of a plant whose time is in 1/`rate`, with derivatives; free bodies stay chains.
+
+        Parameters
+        ----------
+        plant, slopes : StateSpace, Slopes
+            The mechanics (n states): a zero column of A is a free body's position.
+        rate : float
+            1/s.
+
+        Returns
+        -------
+        StateSpace, Slopes
+            With the states (actuators, mechanics, sensors), free bodies parted from all others.
+        """
+        n, m, p = len(plant.A), plant.B.shape[1], len(plant.C)
+        act = self.actuator.system(m, "actuator").in_units(rate, 1.0)
+        sen = self.sensor.system(p, "sensor").in_units(rate, 1.0)
+        a, s = len(act.A), len(sen.A)
+        size, own, behind = a + n + s, slice(a, a + n), slice(a + n, a + n + s)
+
+        def placed(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+            """A, B, C of the mechanics, or of their derivatives, in the states of all."""
+            lead = A.shape[:-2]
+            whole, into = np.zeros((*lead, size, size)), np.zeros((*lead, size, m))
+            out = np.zeros((*lead, p, size))
+            whole[..., own, own], whole[..., own, :a], into[..., own, :] = A, B @ act.C, B @ act.D
+            whole[..., behind, own], out[..., own] = sen.B @ C, sen.D @ C
+            return whole, into, out
+
+        A, B, C = placed(plant.A, plant.B, plant.C)
+        A[:a, :a], B[:a] = act.A, act.B
+        A[behind, behind], C[:, behind] = sen.A, sen.C
+        dA, dB, dC = placed(*slopes)
+        bodies = np.flatnonzero(~plant.A.any(axis=0))
+        if len(bodies):
+            rates = (plant.A[bodies] != 0.0).argmax(axis=1)
+            rates = rates[~plant.A[rates].any(axis=1)]  # that nothing brakes
+            chain = np.union1d(bodies, rates) + a
+            T, back = _apart(A, chain)
+            A, B, C = back @ A @ T, back @ B, C @ T
+            dA, dB, dC = back @ dA @ T, back @ dB, dC @ T
+            rest = np.setdiff1d(np.arange(size), chain)
+            A[np.ix_(chain, rest)] = A[np.ix_(rest, chain)] = 0.0  # but for rounding
+            A[np.ix_(chain, chain)] = plant.A[np.ix_(chain - a, chain - a)]
+        return StateSpace(A, B, C, sen.D @ plant.D @ act.D), Slopes(dA, dB, dC)
+
+
+UNWIRED = Wiring()
+
+
+def _apart(A: Array, chain: np.ndarray) -> tuple[Array, Array]:
+    """T and T⁻¹ of x = T z that part the states `chain` of free bodies from all others.
+
+    In the order (chain, rest) A = [N X; Y R]: X is what drives the bodies, Y reads them. With
+
+        R Z - Z N = -Y,   N W - W R = X,   T = [1 -W; Z 1],   T⁻¹ = [1 W; -Z 1 - Z W]
+
+    T⁻¹ A T is block diagonal, since nothing that reads a body drives one: X Z = W Y = W Z = 0. N is
+    nilpotent and R regular, so that both equations have one solution.
+    """
+    rest = np.setdiff1d(np.arange(len(A)), chain)
+    N, R, X, Y = (A[np.ix_(*pair)] for pair in
+                  ((chain, chain), (rest, rest), (chain, rest), (rest, chain)))  # fmt: skip
+    Z, W = solve_sylvester(R, -N, -Y), solve_sylvester(N, -R, X)
+    T, back = np.eye(len(A)), np.eye(len(A))
+    T[np.ix_(chain, rest)], T[np.ix_(rest, chain)] = -W, Z
+    back[np.ix_(chain, rest)], back[np.ix_(rest, chain)] = W, -Z
+    back[np.ix_(rest, rest)] -= Z @ W
+    return T, back
