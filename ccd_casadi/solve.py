@@ -27,6 +27,7 @@ def summary(solution: "Solution") -> str:
         cost_words,
         gain_words,
         loop_lines,
+        requirement_lines,
         theta_words,
     )
     from ccd_casadi.reporting.run_verdict import advice, terminal_lines
@@ -41,7 +42,7 @@ def summary(solution: "Solution") -> str:
         r=r, decision=advice(r), verdict=terminal_lines(r), theta=theta_words(r),
         hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
         sections=[SectionWords(**item) for item in found],
-        loop_lines=loop_lines(r),
+        loop_lines=loop_lines(r), required=requirement_lines(r),
         design_plant=design_plant_lines(r.get("robust") or {}),
     ).rstrip()  # fmt: skip
 

@@ -20,6 +20,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.requirements import requirements
 from ccd_casadi.codesign.result_entries import budget_entry, move_entry
 from ccd_casadi.codesign.verdict import (
     State,
@@ -107,6 +108,7 @@ def result_dict(
         "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
         "globality": outcome.outer or OuterSolution((), 0),
         "judge": verified.judgement.entry,
+        "requirements": [one.entry for one in requirements(verified)],
         "second_engine": verified.second.entry,
         "box_look": {} if look is None else look.entry,
         "notes": list(plant_of(problem).notes(verified.theta)),

@@ -18,8 +18,7 @@ from scipy.linalg import block_diag, solve_sylvester
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-
-HZ = 2.0 * np.pi
+from ccd_casadi.support.text import HZ
 
 
 class Slopes(NamedTuple):

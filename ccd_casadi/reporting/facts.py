@@ -1,7 +1,7 @@
 """A design in words and numbers: the conclusion, the table of the design, and what binds."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +129,33 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         rows.append((name, unit or "–", "–", low, high, "–", "varies"))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
     return Table(head, tuple(rows))
+
+
+def requirement_lines(result: Mapping[str, Any]) -> list[str]:
+    """Write the requirements for the terminal, one line for each."""
+    found = []
+    for name, required, achieved, margin, where, evidence in _requirement_rows(result):
+        at = f", {where}" if where else ""
+        found.append(f"{name} {required}: {achieved}, margin {margin}{at}, {evidence}")
+    return found
+
+
+def requirements_table(result: Mapping[str, Any]) -> Table:
+    """The requirements, what is achieved, and what is left of each."""
+    head = ("requirement", "at most, or at least", "achieved", "margin", "where", "known by")
+    return Table(head, tuple(_requirement_rows(result)))
+
+
+def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    for one in result.get("requirements", ()):
+        achieved, margin, hz = (one[key] for key in ("achieved", "margin", "frequency_hz"))
+        where = ("" if hz is None else f"{number(hz, 4)} Hz", one["plant"])
+        yield (
+            one["name"], f"{one['required']:.5g}",
+            "not known" if achieved is None else f"{achieved:.5g}",
+            "not known" if margin is None else f"{100.0 * margin:.2f} %",
+            ", ".join(filter(None, where)), one["evidence"],
+        )  # fmt: skip
 
 
 def facts(table: str, *known: Any) -> list[Fact]:

@@ -20,7 +20,14 @@ from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.deployment.realisation import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.reporting.facts import binding, conclusion, facts, run_name, theta_table
+from ccd_casadi.reporting.facts import (
+    binding,
+    conclusion,
+    facts,
+    requirements_table,
+    run_name,
+    theta_table,
+)
 from ccd_casadi.reporting.gain_figures import gains, run_view, view_of
 from ccd_casadi.reporting.landscape import (
     Truths,
@@ -177,6 +184,7 @@ def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Cha
     structured = "proof" in result
     binds = (binding_words if structured else binding)(problem, result)
     body = (
+        requirements_table(result),
         theta_table(problem, result),
         c.Facts(tuple(facts("structured" if structured else "design", problem, result))),
         c.Heading("What binds"),

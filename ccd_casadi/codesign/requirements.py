@@ -1,0 +1,176 @@
+"""Each requirement of a case beside what its design achieves, where, and how that is known.
+
+    margin = 1 - achieved/required      of an upper bound,   achieved/required - 1 of a lower one
+
+so that 0 binds and what is negative is missed. The figures are the judge's, of the plants as their
+function returned them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import isfinite, nan
+from typing import Any
+
+from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.codesign.verified_structured import VerifiedStructured
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words
+from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.objective import constraint_sizes
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.support.text import HZ
+
+
+class Evidence(StrEnum):
+    """How a figure is known; its value is the word for it.
+
+    Attributes
+    ----------
+    PROVEN
+        On the whole set of plants.
+    SEARCHED
+        On many plants of a set, the worst that a search found among them.
+    JUDGED
+        On the plant that the case has.
+    """
+
+    PROVEN = "proven"
+    SEARCHED = "searched"
+    JUDGED = "judged"
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One requirement and what is achieved.
+
+    Attributes
+    ----------
+    name : str
+        The bound's key, or the name of a constraint on θ.
+    required, achieved : float
+        In the unit of the key, `achieved` NaN where it is not known.
+    margin : float
+        See the head of the module; of a constraint λ <= 0 it is -λ over its range.
+    plant : str
+        Where the figure is largest; empty of one plant.
+    frequency_hz : float
+        Where it is attained; NaN where that is not known.
+    evidence : Evidence
+    """
+
+    name: str
+    required: float
+    achieved: float
+    margin: float
+    plant: str
+    frequency_hz: float
+    evidence: Evidence
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Its entry in result.json."""
+        return {**vars(self), "evidence": self.evidence.value}
+
+
+def requirements(verified: Verified) -> tuple[Requirement, ...]:
+    """List the requirements on a design: bounds on the loop, then constraints on θ.
+
+    Parameters
+    ----------
+    verified : Verified
+
+    Returns
+    -------
+    tuple of Requirement
+    """
+    problem, bounds, judged = (
+        verified.problem,
+        kind_of(verified.problem).bounds(),
+        verified.judgement,
+    )
+    required, worst = _required(bounds), _worst(verified, bounds)
+    proven = _proven(verified)
+    evidence = Evidence.SEARCHED if judged.plants > 1 else Evidence.JUDGED
+    found = []
+    for name, share in judged.figures.items():
+        if name in required:
+            achieved = share * required[name] if isfinite(share) else nan
+            found.append(Requirement(
+                key_words(name), required[name], achieved, 1.0 - achieved / required[name],
+                *worst.get(name, ("", nan)), Evidence.PROVEN if name in proven else evidence,
+            ))  # fmt: skip
+    if isinstance(verified, VerifiedStructured) and structured_of(problem).bandwidth_least:
+        least, hz = structured_of(problem).bandwidth_least / HZ, verified.bandwidth / HZ
+        found.append(
+            Requirement("bandwidth_least_hz", least, hz, hz / least - 1.0, "", nan, evidence)
+        )
+    plant = plant_of(problem)
+    values, sizes = constraint_values(plant, verified.theta), constraint_sizes(problem)
+    for name, value, size in zip(plant.constraint_names, values, sizes, strict=True):
+        margin = -float(value) / float(size)
+        found.append(Requirement(name, 0.0, float(value), margin, "", nan, Evidence.JUDGED))
+    return tuple(found)
+
+
+def _required(bounds: Bounds) -> dict[str, float]:
+    """The bounds by the names that the judge has, in the units of their keys."""
+    level, compliance = bounds.weighted_level, bounds.compliance_max
+    known = {
+        "S_max": bounds.S_max,
+        "S_low": bounds.S_low,
+        "KS": level,
+        "T": level,
+        "GS": compliance,
+    }
+    for own in bounds.channels:
+        known |= {f"S_max of {own.name}": own.S_max, f"KS of {own.name}": own.M_K and level}
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def _proven(verified: Verified) -> set[str]:
+    """Which of the judge's figures a proof holds on the whole set."""
+    if not isinstance(verified, VerifiedStructured) or verified.proof.outcome in NOT_APPLICABLE:
+        return set()
+    proof = verified.proof
+    raw = {"S_MAX": "S_max", "S_LOW": "S_low"}
+    return {
+        raw.get(name, name) for name, level in proof.levels.items() if level <= 1.0 + proof.slack
+    }
+
+
+def _worst(verified: Verified, bounds: Bounds) -> dict[str, tuple[str, float]]:
+    """On which plant that the design was made on each figure is largest, and at which frequency."""
+    low = bounds.omega_low / HZ
+    if not isinstance(verified, VerifiedStructured):
+        peak = verified.design.figures.sensitivity_peak_frequency / HZ
+        return {"S_max": ("", peak), "S_low": ("", low)}
+    judged, own = verified.design.certificate, structured_of(verified.problem)
+    if judged is None or not all(plant.stable for plant in judged.plants):
+        return {}
+    uncertain = uncertain_plant(verified.problem, verified.theta)
+    points = [(option, tuple(point)) for option, point in own.scenarios]
+    points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
+    shares = [bounds.shares(plant) for plant in judged.plants]
+    found = {}
+    for name in shares[0]:
+        i = max(range(len(shares)), key=lambda i: shares[i][name])
+        hz = {"S_max": judged.plants[i].S_peak_frequency / HZ, "S_low": low}.get(name, nan)
+        alone = len(shares) == 1
+        label = "" if alone or i >= len(points) else _plant_words(uncertain.names, *points[i])
+        found[name] = (label, hz)
+    return found
+
+
+def _plant_words(names: Sequence[str], option: int, point: Sequence[float]) -> str:
+    parts = [f"[robust] plants {option}"] if option else []
+    for name, value in zip(names, point, strict=True):
+        if name.startswith("theta."):
+            parts.append(f"{name.removeprefix('theta.')} = {value:.4g}")
+        elif name == "damping":
+            parts += [f"damping x {value:g}"] if value != 1.0 else []
+        elif value:
+            parts.append(f"{name} {100.0 * value:+.3g} %")
+    return ", ".join(parts) or "the model"
