@@ -32,6 +32,7 @@ from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 Report = Callable[[str], None] | None
 
@@ -237,6 +238,8 @@ def joint_search(
     )  # fmt: skip
     settles = options.model.settled
     for turn in range(options.rounds):
+        if ends_early("joint round"):
+            break
         excess = options.excess_on_way if turn else WorstPlantOptions.within
         state = state.with_worse_plants(
             state.plants.models, (turn,), excess, report, options, options.lattice_on_way
@@ -269,7 +272,7 @@ def joint_search(
         if settled:
             break
         state = replace(state, plants=Around.of(problem, state.point))
-    if not (settled or ends is not None):
+    if not (settled or ends is not None or time_is_up()):
         state, _ = with_last_steps(state, options.final_seed, report, options)
     counted = structured_of(state.problem).scenarios
     worse = set(counted) - set(structured_of(problem).scenarios)
@@ -361,6 +364,8 @@ def with_last_steps(
     plants = state.plants.at(state.problem, state.point, options.basis_reach)
     state = replace(state, plants=plants).adapted(options)
     for step in range(1, options.final_steps):
+        if ends_early("last joint step"):
+            break
         key = (*state.point.theta, state.point.bandwidth, state.reach, curved)
         proposal = state.proposal("finished", key, options.final_least_gain, report, options)
         J, coarse = state.objective, proposal.gain > options.basis_gain * abs(state.objective)

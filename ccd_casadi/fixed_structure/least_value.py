@@ -50,6 +50,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
+from ccd_casadi.support.time_budget import ends_early
 
 
 @dataclass(frozen=True)
@@ -225,6 +226,8 @@ def least_value(
             break
         if bandwidth < least_bandwidth:
             continue
+        if best.design is not design and ends_early("least-value start"):
+            break
         begin = in_problem_units(problem, np.array(kappa))
         tau = float(np.log(bandwidth / w0))
         if np.isinf(tau):

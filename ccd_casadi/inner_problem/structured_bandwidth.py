@@ -37,6 +37,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.time_budget import time_is_up
 
 
 @dataclass(frozen=True)
@@ -302,6 +303,8 @@ def structured_value(
         spent += 1
     limit = OptimalityOptions.residual
     while made.certified and made.kkt_residual > limit and spent < options.searches:
+        if time_is_up():
+            break
         again = here.searched([made.kappa], workers=workers)
         spent += 1
         kept = (1.0 - options.rounding) * made.bandwidth

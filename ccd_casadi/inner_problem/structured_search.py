@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def race(
     starts = None if only_warm_starts else structured.starts
     made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
     least = options.least_starts
-    if made.certified or starts is None or starts >= least:
+    if made.certified or starts is None or starts >= least or ends_early("controller start", least):
         return made
     return here.searched(warm_starts, least, options.most_starts, tell, workers)
 
@@ -149,6 +150,8 @@ def prepared(
     worst: Excess | None = None
     last = True  # a search that ended off its optimum continues once no plant is found worse
     for turn in range(options.rounds if made.certified else 0):
+        if ends_early("worst-plant check"):
+            break
         worst, wider = _wider(problem, problem.start, made, turn, tell)
         if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
@@ -233,6 +236,8 @@ def least_from(
     for turn in range(options.rounds_of_least):
         problem = wider
         found = ProblemAt(problem, theta).least(design, tell=tell)
+        if time_is_up():
+            break
         wider = _wider(problem, theta, found.design, turn, tell)[1] or problem
         if wider is problem:
             break

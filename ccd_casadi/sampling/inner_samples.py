@@ -213,6 +213,31 @@ def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
     return sample
 
 
+def unsearched(theta: tuple[float, ...]) -> InnerSample:
+    """What is known at a θ that was not searched, since the time was up.
+
+    Parameters
+    ----------
+    theta : tuple of float
+        SI.
+
+    Returns
+    -------
+    InnerSample
+        Not feasible.
+    """
+    nothing = dict.fromkeys(("bandwidth", "gradient", "omega_S", "omega_T", "violation"))
+    words = "the time budget ended before this theta was searched"
+    own = {"active": [], "shortfall": words, "syntheses": 0}
+    return inner_sample(theta, nothing | own)
+
+
+def unsearched_quantities(x: tuple[float, ...], inner: InnerBounds) -> QuantitySample:
+    """The same of a synthesis at x = (θ, ln ω_S, ln ω_T) that was not made."""
+    count = 2 + len(inner.bounds)
+    return QuantitySample(x, np.full(count, np.nan), np.full((count, len(x)), np.nan), False)
+
+
 def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerBounds) -> QuantitySample:
     """A row with derivatives as values at x.
 

@@ -13,6 +13,7 @@ from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
 
 from ccd_casadi.support.interrupts import raise_dropped
+from ccd_casadi.support.time_budget import InTime
 from ccd_casadi.support.worker_process import (
     R,
     T,
@@ -124,10 +125,11 @@ class Workers(AbstractContextManager["Workers"]):
         self._mapping = True
         waiting, retried = deque(range(done_here, len(tasks))), set[int]()
         running: Running = {}
+        in_time = InTime(function)
         try:
             while waiting or running:
                 raise_dropped()
-                self._feed(function, tasks, waiting, running)
+                self._feed(in_time, tasks, waiting, running)
                 for pipe in connection.wait(list(running)):
                     assert isinstance(pipe, connection.Connection)
                     worker, index = running[pipe]
@@ -148,7 +150,7 @@ class Workers(AbstractContextManager["Workers"]):
                         continue
                     # Only now: an interrupted answer leaves the worker among those to be ended.
                     del running[pipe]
-                    self._feed(function, tasks, waiting, running)
+                    self._feed(in_time, tasks, waiting, running)
                     if not done:
                         raise value
                     yield value
