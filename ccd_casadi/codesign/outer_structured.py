@@ -257,7 +257,7 @@ def _worst_plants(
     none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
     problem, tell = sampler.problem, printer("at the end", sampler.quiet)
     on_box = DesignOnBox(problem, best.theta, design)
-    worst, scenarios = on_box.worst(0, tell)
+    worst, scenarios = on_box.worst(0, tell, sampler.workers)
     if scenarios or not np.isfinite(objective_of(problem, best)):
         return worst, scenarios
     if ends_early("worst-plant check", options.searches):

@@ -56,7 +56,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
     def searched() -> InitialSearch:
         tell = printer("search at the start", sampler.quiet)
         anchored, made, _ = prepared(problem, tell, sampler.workers)
-        anchored, made, _ = least_from(anchored, problem.start, made, tell)
+        anchored, made, _ = least_from(anchored, problem.start, made, tell, sampler.workers)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
@@ -91,7 +91,7 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
-        found = ProblemAt(problem, theta).value_of(made, 1)
+        found = ProblemAt(problem, theta).value_of(made, 1, workers=sampler.workers)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
     sampler.count_multistart(sample_key(sampler.hash, theta))

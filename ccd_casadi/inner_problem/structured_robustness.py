@@ -99,7 +99,9 @@ class DesignOnBox:
         """The plants of the box at θ."""
         return uncertain_plant(self.problem, self.theta)
 
-    def worst(self, turn: int = 0, tell: Tell = silent) -> tuple[Excess, tuple[Scenario, ...]]:
+    def worst(
+        self, turn: int = 0, tell: Tell = silent, workers: Pool | None = None
+    ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of the box, and those to add: past a bound, each a new one.
 
         Where a move's time counts the plant that settles latest besides, if it is later than v.
@@ -107,7 +109,7 @@ class DesignOnBox:
         problem, theta, design = self.problem, self.theta, self.design
         worst, found = violations(
             problem, self.uncertain, design.kappa, design.bandwidth, turn, tell,
-            options=self.options,
+            options=self.options, workers=workers,
         )  # fmt: skip
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
@@ -228,6 +230,7 @@ def violations(
     others: Sequence[Scenario] = (),
     count: int = WorstPlantOptions.lattice,
     options: BoxCheckOptions = BoxCheckOptions(),
+    workers: Pool | None = None,
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """Search the worst plant of a box for a controller.
 
@@ -244,7 +247,7 @@ def violations(
         ln of a bound, above which a plant violates it.
     others : sequence of (option, point)
         Known plants, which are tried besides.
-    options : BoxCheckOptions
+    options, workers : BoxCheckOptions, Pool
 
     Returns
     -------
@@ -257,7 +260,7 @@ def violations(
                      structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
     tried = loop.excesses(known).tolist() if known else []
-    heads, count = worst_plants(loop, structured.seed + turn, count)
+    heads, count = worst_plants(loop, structured.seed + turn, count, workers=workers)
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
     if tell is not None:

@@ -188,7 +188,7 @@ class Sampler:
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            alone = len(tasks) == 1 < self.workers.count  # then it may spread its own searches
+            alone = len(tasks) == 1  # then it may spread its own searches
             unit = partial(inner_unit, workers=self.workers) if alone else inner_unit
             # of a single θ something is known at any time: what ends a search builds on it
             of_key = {task[2]: (unit, task, len(tasks) == 1) for task in tasks}
