@@ -121,7 +121,9 @@ def result_dict(
     return json_values(result)
 
 
-def of_budget(solution: Solution, spent: TimeBudget) -> Solution:
+def of_budget(
+    solution: Solution, spent: TimeBudget, seconds: Mapping[str, Any] | None = None
+) -> Solution:
     """A solution as its time budget leaves it.
 
     Where that ended a search nothing is known of the optimum: `optimal` and its checks are unknown,
@@ -131,13 +133,16 @@ def of_budget(solution: Solution, spent: TimeBudget) -> Solution:
     ----------
     solution : Solution
     spent : TimeBudget
+    seconds : mapping
+        Of the wall and of processors, by purpose.
 
     Returns
     -------
     Solution
-        With `time_budget` in its result.
+        With `time_budget` and `phase_seconds` in its result.
     """
-    result, words = {**solution.result, "time_budget": spent.entry}, spent.words
+    own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
+    result, words = {**solution.result, **own}, spent.words
     if words and "verdict" in result:
         line = result["verdict"]["optimal"]
         said = {"state": State.UNKNOWN.value, "words": f"{words}; {line['words']}"}

@@ -121,7 +121,8 @@ def within(minutes: float, sampler: Sampler, formulation: Formulation, seed: int
         Its result says whether the budget ended it, and what was not searched.
     """
     with within_budget(minutes) as spent:
-        return of_budget(co_design(sampler, formulation, seed), spent)
+        found = co_design(sampler, formulation, seed)
+        return of_budget(found, spent, sampler.spent.seconds())
 
 
 def co_design(

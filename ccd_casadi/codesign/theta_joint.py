@@ -166,7 +166,7 @@ class JointState:
             options.model,
         )  # fmt: skip
         found = self.working.sampler.cached(kind, key, Proposal, make)
-        if report is not None:
+        if report is not None and np.isfinite(self.objective):
             digits, step = ("6", "step") if least_gain is None else ("8", "last step")
             gain = max(found.gain, 0.0)
             report(f"J {self.objective:.{digits}g}, predicted gain of a {step} {gain:.2g}")
@@ -293,7 +293,7 @@ def _after_poll(
     plants = Around.of(problem, place)
     other = replace(state, point=place, plants=plants, reach=options.first_reach)
     other = other.with_worse_plants(plants.models, (turn,), options.excess_on_way, report, options)
-    if report is not None:
+    if report is not None and np.isfinite(other.objective):
         away = f"{options.poll_step:g} of the box away along one axis"
         report(f"J {other.objective:.6g} at the best place {away}")
     return other

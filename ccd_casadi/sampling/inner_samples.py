@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -12,24 +13,53 @@ from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.sampling.store import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import restored
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 class SynthesisCounts:
-    """Counts of true syntheses; `purpose` is what is being done."""
+    """Counts of true syntheses, and times; `purpose` is what is being done.
 
-    def __init__(self) -> None:
-        self.purpose = "samples"
+    Parameters
+    ----------
+    workers : Pool, optional
+        Whose processor time counts beside this process's.
+
+    Attributes
+    ----------
+    told : float
+        The least J that was reported as the best so far.
+    """
+
+    def __init__(self, workers: Pool | None = None) -> None:
+        self.purpose, self.told = "samples", np.inf
         self._units: dict[str, tuple[str, int]] = {}
+        self._workers, self._seconds = workers, dict[str, Array]()
+        self._since = self._clocks()
+
+    def _clocks(self) -> Array:
+        beside = getattr(self._workers, "processor_seconds", 0.0)
+        return np.array([perf_counter(), process_time() + beside])
+
+    def seconds(self) -> dict[str, dict[str, float]]:
+        """Of the wall and of processors, workers' included, by purpose, up to now."""
+        now = self._clocks()
+        before = self._seconds.get(self.purpose, np.zeros(2))
+        self._seconds[self.purpose] = before + now - self._since
+        self._since = now
+        return {name: dict(zip(("wall", "processor"), np.round(own, 3).tolist(), strict=True))
+                for name, own in self._seconds.items()}  # fmt: skip
 
     @contextmanager
     def on(self, purpose: str) -> Iterator[None]:
         """Count the syntheses inside for this purpose."""
+        self.seconds()
         before, self.purpose = self.purpose, purpose
         try:
             yield
         finally:
+            self.seconds()
             self.purpose = before
 
     def once(self, unit: str, count: int) -> bool:

@@ -107,7 +107,7 @@ class Sampler:
         self.quiet = quiet
         self.hash, self.inner_hash = hashes_of(problem)
         store.put_problem(self.hash, problem.identity())
-        self.spent = SynthesisCounts()
+        self.spent = SynthesisCounts(workers)
         self.trace: list[TraceEntry] = []
         self.nearest: InnerSample | None = None
         self.solved: dict[tuple[float, ...], InnerSample] = {}
@@ -317,7 +317,10 @@ class Sampler:
             J[best]
         ):
             bandwidth = self.trace[best].bandwidth / HZ
-            label = "best so far" if self.whole else "best of this part"
+            label = "best of this part"
+            if self.whole:  # of a design that was found before a plant may exceed a bound
+                label = "best so far" if J[best] < self.spent.told else "best on more plants"
+                self.spent.told = min(self.spent.told, float(J[best]))
             remark(f"{label}: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
 
     def _worth(self, sample: Sample) -> float:

@@ -92,10 +92,15 @@ class Workers(AbstractContextManager["Workers"]):
         self.count = max(1, count)
         self.patience = patience
         self._workers: list[WorkerProcess] = []
-        self._mapping = False
+        self._mapping, self._ended = False, 0.0
 
     def __exit__(self, *_: object) -> None:
         self._end(self._workers)
+
+    @property
+    def processor_seconds(self) -> float:
+        """What its processes have used up to now."""
+        return self._ended + sum(worker.processor_seconds for worker in self._workers)
 
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
@@ -177,6 +182,7 @@ class Workers(AbstractContextManager["Workers"]):
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():
             for worker in [worker for worker in workers if worker in self._workers]:
+                self._ended += worker.processor_seconds
                 worker.end()
                 self._workers.remove(worker)
 

@@ -45,7 +45,7 @@ class TimeBudget:
     """
 
     minutes: float = math.inf
-    began: float = field(default_factory=time.monotonic)
+    began: float = field(default_factory=lambda: time.monotonic())
     left: Counter[str] = field(default_factory=Counter)
 
     def until(self, share: float) -> float:

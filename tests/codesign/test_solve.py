@@ -192,6 +192,7 @@ def test_a_second_run_reuses_every_sample(
     assert f"resuming      {folder / 'samples.sqlite'} holds " in capsys.readouterr().err
     after = read(folder)
     assert after.pop("seconds") < before.pop("seconds")
+    assert after.pop("phase_seconds").keys() == before.pop("phase_seconds").keys()
     assert after == before
 
 
