@@ -1,6 +1,7 @@
 """The outer problem from a formulation to a verified design, with a check of the whole box."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -16,6 +17,7 @@ from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage, time_is_up
 from surrogates import design
 from surrogates.fitting import recalibrated
@@ -195,6 +197,7 @@ def search_outer(
     """
     outer = outer.prepared(seed)
     end: PolishedDesign | None = None
+    look: GlobalCheck | None = None
     for rounds in count(1):
         outcome = FormulationResult(known, agreed=True)
         if known is None:
@@ -206,7 +209,12 @@ def search_outer(
         if outcome.x is None:
             return SearchResult(outer, outcome, None, rounds)
         with stage(StageOptions.ending):
-            end = outer.polished(outcome.x)
+            try:
+                end = outer.polished(outcome.x)
+            except NoDesign as error:
+                if end is None:
+                    return SearchResult(outer, FormulationResult(message=str(error)), None, rounds)
+                break
             # of a design that exceeds a bound on a plant nothing is gained, whatever the time
             last = rounds >= (2 * most if time_is_up() else most)
             more = None if last else outer.extended(end)
@@ -232,15 +240,18 @@ def _after_global_check(
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
     if look.x is not None:
-        with stage(StageOptions.ending):
+        with stage(StageOptions.ending), suppress(NoDesign):
             found = outer.polished(look.x)
-        end = best_end([end, found], outer.kkt_level, formulation.tolerance)
+            end = best_end([end, found], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity
     retried = outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level
     if retried and not ends_early("perturbed start", GlobalCheckOptions.perturbed_starts):
         with outer.sampler.spent.on("polish"):
             starts = perturbed(outer, end.x, seed)
-        ends = [end, *map(outer.polished, starts)]
+        ends = [end]
+        for x in starts:
+            with suppress(NoDesign):
+                ends.append(outer.polished(x))
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible:

@@ -50,7 +50,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
@@ -160,7 +160,7 @@ class StructuredOuter(ThetaOuter):
             if found.design.controller is None:
                 at = dict(zip(problem.names, best.theta, strict=True))
                 words = f"no controller was found again at {at}: {found.design.words}"
-                raise UserError(f"{words}; give more controller.starts, or another --seed")
+                raise NoDesign(f"{words}; give more controller.starts, or another --seed")
             worst, scenarios = _worst_plants(sampler, best, found.design, options)
             over = scenarios or ends_early("multi-start check")
             multistart = None if over else multistart_at(sampler, best)

@@ -87,7 +87,9 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     StructuredValue
         With all local optima of its design.
     """
-    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
+    problem, theta = sampler.problem, best.theta
+    if best.kappa:
+        problem = with_warm_start(problem, best.kappa)
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
