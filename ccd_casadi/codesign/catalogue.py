@@ -141,7 +141,8 @@ def best_of_lists(
             least = best.result["objective"] - _same(problem, best, options.no_better)
         if part.bound >= least or (part.lost and np.isfinite(least)):
             break
-        if nodes and ends_early("listed combination", sum(p.count for p in open_)):
+        left = sum(p.count for p in open_ if p.found is None)
+        if nodes and ends_early("listed combination", left):
             break
         open_.remove(part)
         if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:

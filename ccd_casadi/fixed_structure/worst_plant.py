@@ -29,6 +29,9 @@ class WorstPlantOptions:
     ----------
     within : float
         By how much a plant of the box may exceed a bound and count as within.
+    along, along_first : int
+        Points along each parameter of the model that varies, and of a first look: only where that
+        finds no plant beyond its bounds all of them are assessed.
     batch : int
         Plants that are assessed together.
     few : int
@@ -48,6 +51,8 @@ class WorstPlantOptions:
     """
 
     within: float = 1e-4
+    along: int = 61
+    along_first: int = 16
     batch: int = 48
     few: int = 4
     lattice: int = 200
@@ -314,7 +319,7 @@ def _moved(
 
 
 def lattice(
-    uncertain: UncertainPlant, count: int, seed: int, *, along: int = 61
+    uncertain: UncertainPlant, count: int, seed: int, *, along: int = WorstPlantOptions.along
 ) -> list[tuple[int, Array]]:
     """Spread plants over the box: corners, lines along ranges, and a Latin hypercube.
 
@@ -355,6 +360,7 @@ def lattice(
 def worst_plants(
     loop: LoopOnBox, seed: int = 0, count: int = WorstPlantOptions.lattice,
     options: WorstPlantOptions = WorstPlantOptions(), workers: Pool | None = None,
+    along: int = WorstPlantOptions.along,
 ) -> tuple[list[Excess], int]:  # fmt: skip
     """Search the worst plants of a box.
 
@@ -367,6 +373,8 @@ def worst_plants(
     count : int
         Plants of the lattice, of many parameters `options.lattice_of_many` at most.
     options, workers : WorstPlantOptions, Pool
+    along : int
+        As of `lattice`.
 
     Returns
     -------
@@ -377,10 +385,10 @@ def worst_plants(
     """
     uncertain, n = loop.uncertain, len(loop.uncertain.names)
     if n > options.few:
-        points = lattice(uncertain, min(count, options.lattice_of_many), seed)
+        points = lattice(uncertain, min(count, options.lattice_of_many), seed, along=along)
         points = _sharp(uncertain, points, options.damped_every)
         return climbed(loop, [*points, *meetings(uncertain)], options)
-    points = lattice(uncertain, count, seed)
+    points = lattice(uncertain, count, seed, along=along)
     value = loop.excesses(points, workers)
     looked, first = len(points), np.argsort(-value)[: options.searches]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]

@@ -260,24 +260,33 @@ def violations(
                      structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
     tried = loop.excesses(known).tolist() if known else []
-    heads, count = worst_plants(loop, structured.seed + turn, count, workers=workers)
-    heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
-    heads.sort(key=lambda head: -head.value)
+    lines, width = WorstPlantOptions(), uncertain.box[1] - uncertain.box[0]
+    before = [Excess(*one, value) for one, value in zip(known, tried, strict=True)]
+
+    def fresh(heads: Sequence[Excess]) -> tuple[Scenario, ...]:
+        found: list[Scenario] = []
+        for head in heads:
+            near = [
+                float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
+                for option, point in (*structured.scenarios, *found)
+                if option == head.option
+            ]
+            apart = not near or min(near) > options.apart
+            if head.value > within and apart and len(found) < options.added:
+                found.append((head.option, tuple(map(float, head.point))))
+        return tuple(found)
+
+    looked = 0
+    for along in (lines.along_first, lines.along) if uncertain.ranges else (lines.along,):
+        seed = structured.seed + turn
+        heads, more = worst_plants(loop, seed, count, workers=workers, along=along)
+        heads, looked = sorted([*before, *heads], key=lambda head: -head.value), looked + more
+        worse = fresh(heads)
+        if worse:
+            break
     if tell is not None:
-        tell(f"{of_a_bound(heads[0].value)} at most on {count} plants")
-    width = uncertain.box[1] - uncertain.box[0]
-    counted = structured.scenarios
-    found: list[Scenario] = []
-    for head in heads:
-        near = [
-            float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
-            for option, point in (*counted, *found)
-            if option == head.option
-        ]
-        apart = not near or min(near) > options.apart
-        if head.value > within and apart and len(found) < options.added:
-            found.append((head.option, tuple(map(float, head.point))))
-    return heads[0], tuple(found)
+        tell(f"{of_a_bound(heads[0].value)} at most on {looked} plants")
+    return heads[0], worse
 
 
 def recertified(
