@@ -151,7 +151,7 @@ def _spread(outer: Outer, points: int, seed: int, cluster: float) -> tuple[list[
     more: list[InnerSample] = []
     if free:
         found = sampler.values(np.array(free), "global check")
-        more = [one for one in found if one.theta in sampler.solved]  # the others' time was up
+        more = [one for one in found if one.searched]
     return [*known, *more], len(more)
 
 

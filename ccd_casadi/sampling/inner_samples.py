@@ -154,6 +154,11 @@ class InnerSample(InnerValue):
     kappa: tuple[float, ...] = ()
 
     @property
+    def searched(self) -> bool:
+        """Whether the inner problem was solved there: the time was not up before."""
+        return self.syntheses > 0
+
+    @property
     def x(self) -> tuple[float, ...]:
         """What a surrogate of it is over: θ."""
         return self.theta
