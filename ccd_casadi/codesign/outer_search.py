@@ -204,8 +204,8 @@ def search_outer(
             outcome = outer.solve_formulation(formulation, seed)
         if outcome.x is None:
             outcome = outer.fallback(outcome, seed)
-        if outcome.x is None and end is not None and time_is_up():
-            outcome = FormulationResult(end.x, agreed=True)
+        if outcome.x is None and time_is_up():
+            outcome = replace(outcome, x=_at_hand(outer, end))
         if outcome.x is None:
             return SearchResult(outer, outcome, None, rounds)
         with stage(StageOptions.ending):
@@ -227,6 +227,15 @@ def search_outer(
         goes_on = known is not None or isinstance(formulation, Direct) or time_is_up()
         outer, known = more, end.x if goes_on else None
     return SearchResult(outer, outcome, end, rounds, look)
+
+
+def _at_hand(outer: Outer, end: PolishedDesign | None) -> Array | None:
+    """x where the time is up and a formulation has none: of an end before, else the start."""
+    if end is not None or violated(outer.problem, outer.problem.start):
+        return None if end is None else end.x
+    with stage(StageOptions.ending):
+        sample = outer.sampler.values(np.array(outer.problem.start), "at the start")[0]
+    return sample.joint if sample.feasible else None
 
 
 def _after_global_check(

@@ -64,7 +64,7 @@ class TimeBudget:
             return ""
         left = ", ".join(counted(count, name) for name, count in self.left.items())
         words = f"the search ended with its budget of {self.minutes:g} min, not searched: {left}"
-        return f"{words}; a larger --budget goes on from what is stored"
+        return f"{words}; a larger --budget continues from what is stored"
 
     @property
     def entry(self) -> dict[str, object]:
