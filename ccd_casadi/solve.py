@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.cases.first_look import DRAWING, SAMPLING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
+from ccd_casadi.support.options import positive
 from ccd_casadi.support.process_pool import PoolOptions
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.text import counted
@@ -125,6 +126,8 @@ def of_workers(options: argparse.Namespace) -> Sequence[str]:
     "ccd_casadi.solve", "Design a stage and its controller together.",
     option("--formulation", choices=FORMULATIONS,
            help="default: nested, or direct with many parameters or lists"),
+    option("--budget", metavar="MINUTES", type=positive,
+           help="end with the best design found in this time (default: [outer] minutes, 5)"),
     option("--resume", action="store_true",
            help="print what the run folder holds; every run continues from it"),
     option("--no-report", action="store_true",
@@ -138,7 +141,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
     from ccd_casadi.codesign.result import resolved, write_run
-    from ccd_casadi.codesign.run import co_design
+    from ccd_casadi.codesign.run import within
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
@@ -162,7 +165,9 @@ def main(options: argparse.Namespace) -> ExitCode:
                 held = counted(samples.count(), "row") if samples.count() else "nothing yet"
                 inform(f"resuming      {store} holds {held}", sys.stderr)
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-            solution = with_units(co_design(sampler, formulation, options.seed), case, problem)
+            minutes = options.budget or case.outer.minutes
+            found = within(minutes, sampler, formulation, options.seed)
+            solution = with_units(found, case, problem)
             write_run(folder, case, solution)
         code = ExitCode.of(solution.result["status"])
         inform(summary(solution))

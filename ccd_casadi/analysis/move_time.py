@@ -206,10 +206,16 @@ class MoveTime:
         T = self.hold.period
         return T * np.arange(int(np.ceil(self.motion.cycle.profile.duration / T)) + 2, dtype=float)
 
+    @cached_property
+    def _signals(self) -> tuple[Array, Array]:
+        """The setpoint and the force ahead at these instants."""
+        motion = self.motion
+        return forward_force(motion.cycle.profile, motion.forward, self._time, self.hold.period)
+
     def _crossings(self, kappa: Array) -> list[_Crossing]:
         T, motion = self.hold.period, self.motion
         K = tustin(self.structure.state_space(kappa), T)
-        r, f = forward_force(motion.cycle.profile, motion.forward, self._time, T)
+        r, f = self._signals
         window, options = motion.motion.window, self.options
         return [_Crossing(G, K, r, f, window, T, options) for G in self._sampled]
 

@@ -278,6 +278,9 @@ class OuterTable:
     box_points: int = key(
         "number of θ over the box in the global check at the end; 0: no check", 32
     )
+    minutes: float = key(
+        "time budget of `solve`: the best design found in it is judged", 5.0, unit="min"
+    )
 
 
 @dataclass(frozen=True)

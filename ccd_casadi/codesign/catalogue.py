@@ -25,12 +25,15 @@ import numpy as np
 from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
+from ccd_casadi.inner_problem.objective import constraint_shares
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
 from ccd_casadi.support.text import counted
+from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 
 Lists = dict[str, tuple[float, ...]]
 Search = Callable[[Sampler, Solution | None], Solution]
@@ -44,6 +47,7 @@ class BranchOptions:
     on_value: float = 1e-6  # of a range: this close to a value of its list an optimum is on it
     no_better: float = 1e-6  # of the terms of J: a bound that is lower by less is cut
     few: int = 4  # combinations up to which all are searched: bounds would save no search
+    undecided: int = 12  # lists of which two values are tried where the time is up
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,9 @@ def best_of_lists(
             least = best.result["objective"] - _same(problem, best, options.no_better)
         if part.bound >= least or (part.lost and np.isfinite(least)):
             break
+        left = sum(p.count for p in open_ if p.found is None)
+        if nodes and ends_early("listed combination", left):
+            break
         open_.remove(part)
         if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
             rows = product(*([(v,) for v in values] for values in part.lists.values()))
@@ -174,7 +181,12 @@ def best_of_lists(
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
         remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
-    assert best is not None
+    if best is None:  # the time was up
+        with stage(StageOptions.ending):
+            best, lists = _in_the_time_left(sampler, at, judge, open_, known, options)
+        name, J = best.result["status"], best.result.get("objective", np.inf)
+        node = Node(lists, name, J, _made_of(problem, best.result))
+        nodes[tuple(lists.values())] = node
     result = with_all_spent(best.result, sampler.spent.by_purpose) | {
         "seconds": perf_counter() - began,
         "listed": _listed(problem, best, [*nodes.values()], open_, judged),
@@ -184,6 +196,57 @@ def best_of_lists(
     if result["status"] == "infeasible":
         result["reason"] = "; ".join(filter(None, (result["reason"], words)))
     return replace(best, result=result | {"notes": notes})
+
+
+def _in_the_time_left(
+    sampler: Sampler, at: Search, judge: Judge | None, open_: Sequence[_Part],
+    known: Sequence[Solution], options: BranchOptions,
+) -> tuple[Solution, Lists]:  # fmt: skip
+    """The design of one combination: of the best that was found, else the nearest to what was."""
+    problem = sampler.problem
+    found = min((part for part in open_ if part.found), key=lambda p: p.bound, default=None)
+    if found is not None and found.found is not None and judge is not None:
+        own = restricted(problem, found.lists)
+        solution = judge(sampler.of(own), found.found)
+        return replace(solution, problem=solution.problem or own), found.lists
+    best = min(known, key=lambda one: one.result["objective"], default=None)
+    theta = dict(zip(problem.names, problem.start, strict=True))
+    lists = _nearest(problem, theta if best is None else theta | _point(best), options)
+    own = restricted(problem, lists)
+    solution = at(sampler.of(own), best)
+    if judge is not None and np.isfinite(solution.result.get("objective", np.inf)):
+        solution = judge(sampler.of(own), replace(solution, problem=solution.problem or own))
+    return replace(solution, problem=solution.problem or own), lists
+
+
+def _nearest(problem: CoDesignProblem, theta: Mapping[str, float], options: BranchOptions) -> Lists:
+    """The combination of listed values near a θ that keeps the constraints, with the least change
+    of these too: of places that are to be chosen in part."""
+    near = {name: sorted(values, key=lambda v: abs(v - theta[name]))[:2]
+            for name, values in problem.listed}  # fmt: skip
+
+    def undecided(name: str) -> float:
+        first, *second = (abs(value - theta[name]) for value in near[name])
+        return -second[0] / max(first, 1e-300) if second else -np.inf
+
+    both = set(sorted(near, key=undecided, reverse=True)[: options.undecided])
+    rows = product(*(near[name] if name in both else near[name][:1] for name in near))
+    width = np.subtract(problem.upper, problem.lower)
+
+    def shares(one: Mapping[str, float]) -> Array:
+        return constraint_shares(problem, np.array([one[name] for name in problem.names]))
+
+    here = shares(theta)
+
+    def away(one: Mapping[str, float]) -> tuple[float, float]:
+        there = shares(one)
+        moved = [abs(one[name] - theta[name]) for name in problem.names] / width
+        return float(there.max(initial=0.0)), float(
+            moved.sum() + len(near) * abs(there - here).sum()
+        )
+
+    best = min((dict(theta) | dict(zip(near, row, strict=True)) for row in rows), key=away)
+    return {name: (best[name],) for name in near}
 
 
 def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: float) -> str:

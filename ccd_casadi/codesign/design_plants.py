@@ -26,6 +26,7 @@ from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.time_budget import time_is_up
 
 CONTINUED = "reached by continuation from narrower ranges"
 REPORTED = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
@@ -78,7 +79,7 @@ def best_over_design_plants(
     samplers = [sampler.of(choice) if len(choices) > 1 else sampler for choice in choices]
     found = [solve(outer_of(each)) for each in samplers]
     share = None
-    if problem.robust is not None and not any(map(_holds, found)):
+    if problem.robust is not None and not any(map(_holds, found)) and not time_is_up():
         share = 0.0
         alone = solve(outer_of(sampler.of(replace(problem, robust=None), traced=False)))
         if alone.verified is not None:

@@ -205,7 +205,7 @@ def structured_answer(
         asked = with_structured(asked, warm_starts=(kappa,))
     asked, made, worst = prepared(asked, tell, workers, begin_at is not None)
     fastest = made.bandwidth
-    asked, made, least = least_from(asked, theta, made, tell)
+    asked, made, least = least_from(asked, theta, made, tell, workers)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
@@ -220,7 +220,7 @@ def structured_answer(
         }
     on_box = DesignOnBox(asked, theta, made)
     if worst is None or least is not None:
-        worst = on_box.worst()[0]
+        worst = on_box.worst(workers=workers)[0]
     wide, checked, proof = on_box.judged(worst, workers)
     assert made.controller is not None
     second = second_on_set(asked, theta, made)

@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim.quadratic_programmes import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, Step, TrustRegionModel, minimise
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.time_budget import not_searched, time_is_up
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ def descend(
         model, here, scale * np.eye(x.size), radius, steps=steps, penalty=scale,
         least_gain=settled * abs(here.value),
     )  # fmt: skip
+    not_searched("local solve")
     return model.box.lower + model.box.width * end.best.x
 
 
@@ -121,6 +123,8 @@ class _Peaks(TrustRegionModel[_Design]):
 
     def at(self, x: Array) -> Iterate[_Design] | None:
         """A certified design with ∇J, its constraints and its peaks."""
+        if time_is_up():
+            return None
         z = np.clip(x, 0.0, 1.0)
         there = TrueDesign(self.truth, self.box.lower + self.box.width * z)
         made = there.design

@@ -28,6 +28,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.inner_samples import QuantitySample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.time_budget import ends_early
 from surrogates import GaussianProcess, design, fit_outputs, to_casadi
 
 
@@ -100,6 +101,8 @@ def solve_lifted(
     solution: OuterSolution | None = None
     agreed, fitted = False, 0
     for round_number in range(options.max_refinements + 1):
+        if incumbent is not None and ends_early("sampling round"):
+            break
         if len(samples) >= rounds.refit_growth * fitted:
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)
             fitted = len(samples)

@@ -29,6 +29,7 @@ from ccd_casadi.optim.pieces import Box
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.time_budget import ends_early
 from surrogates import GaussianProcess, design, fit, to_casadi
 
 
@@ -151,6 +152,8 @@ def solve_nested(
         return replace(state, samples=(*state.samples, *found))
 
     for number in range(options.max_refinements + 1):
+        if ends_early("sampling round"):
+            break
         state = replace(state, samples=tuple(sampler.latest(state.samples)))
         improvements, best = sampler.improvements, _best(problem, state.samples)
         region = bounds.around(best.theta, state.radius)

@@ -32,6 +32,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import counted
+from ccd_casadi.support.time_budget import ends_early
 from surrogates import design
 
 
@@ -160,6 +161,8 @@ class Outer(ABC):
             return FormulationResult(samples[0].joint, agreed=True)
         ends: list[Place] = []
         for sample in samples:
+            if ends and ends_early("local solve"):
+                continue
             end = self.local_solve(sample, ends)
             ends += [] if end is None else [end]
         if not ends:

@@ -60,8 +60,8 @@ class MixedOuter(Outer):
             samples = self.sampler.values(points, "search for a feasible design")
         feasible = [sample for sample in samples if sample.feasible]
         if not feasible:
-            assert self.sampler.nearest is not None
-            words = self.sampler.nearest.shortfall
+            nearest = self.sampler.nearest  # None: no time was left for any
+            words = samples[0].shortfall if nearest is None else nearest.shortfall
             return FormulationResult(iterates=outcome.iterates, message=words)
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)

@@ -1,6 +1,7 @@
 """The outer problem from a formulation to a verified design, with a check of the whole box."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -16,6 +17,8 @@ from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import NoDesign
+from ccd_casadi.support.time_budget import StageOptions, ends_early, stage, time_is_up
 from surrogates import design
 from surrogates.fitting import recalibrated
 
@@ -51,6 +54,7 @@ def global_check(
     are added, away from what is known: the way to one optimum says nothing of another.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
+    points = 0 if ends_early("global check") else points
     if not outer.global_check_is_cheap:
         points = min(points, options.expensive_points)
     samples, fresh = _spread(outer, points, seed, options.cluster) if points else ([], 0)
@@ -63,8 +67,10 @@ def global_check(
 
     def solve_from(starts: Sequence[InnerSample]) -> None:
         nonlocal best_x, best, begun
-        begun += len(starts)
         for sample in starts:
+            if ends_early("local solve"):
+                continue
+            begun += 1
             place = outer.local_solve(sample, known)
             if place is not None:
                 known.append(place)
@@ -141,10 +147,12 @@ def _spread(outer: Outer, points: int, seed: int, cluster: float) -> tuple[list[
         solved = np.reshape([one.theta for one in known], (-1, n))
         away = bounds.away(spread[:, None], solved)
         spread = spread[(away > 0.5 * points ** (-1.0 / n)).all(axis=1)]
-    more = [theta for theta in spread if not violated(outer.problem, theta)]
-    if more:
-        known = [*known, *sampler.values(np.array(more), "global check")]
-    return known, len(more)
+    free = [theta for theta in spread if not violated(outer.problem, theta)]
+    more: list[InnerSample] = []
+    if free:
+        found = sampler.values(np.array(free), "global check")
+        more = [one for one in found if one.searched]
+    return [*known, *more], len(more)
 
 
 def _starts(
@@ -188,25 +196,46 @@ def search_outer(
     `known`: x of a local optimum that another search has found, in place of the formulation.
     """
     outer = outer.prepared(seed)
+    end: PolishedDesign | None = None
+    look: GlobalCheck | None = None
     for rounds in count(1):
         outcome = FormulationResult(known, agreed=True)
         if known is None:
             outcome = outer.solve_formulation(formulation, seed)
         if outcome.x is None:
             outcome = outer.fallback(outcome, seed)
+        if outcome.x is None and time_is_up():
+            outcome = replace(outcome, x=_at_hand(outer, end))
         if outcome.x is None:
             return SearchResult(outer, outcome, None, rounds)
-        end = outer.polished(outcome.x)
-        more = None if rounds == most else outer.extended(end)
+        with stage(StageOptions.ending):
+            try:
+                end = outer.polished(outcome.x)
+            except NoDesign as error:
+                if end is None:
+                    return SearchResult(outer, FormulationResult(message=str(error)), None, rounds)
+                break
+            # of a design that exceeds a bound on a plant nothing is gained, whatever the time
+            last = rounds >= (2 * most if time_is_up() else most)
+            more = None if last else outer.extended(end)
         if more is None:
             outcome, found, look = _after_global_check(outer, outcome, end, formulation, seed)
             moved = found is not end and rounds < most
             more, end = outer.extended(found) if moved else None, found
         if more is None:
             break
-        goes_on = known is not None or isinstance(formulation, Direct)
+        goes_on = known is not None or isinstance(formulation, Direct) or time_is_up()
         outer, known = more, end.x if goes_on else None
     return SearchResult(outer, outcome, end, rounds, look)
+
+
+def _at_hand(outer: Outer, end: PolishedDesign | None) -> Array | None:
+    """x where the time is up and a formulation has none: of an end before, else the start."""
+    if end is not None or violated(outer.problem, outer.problem.start):
+        return None if end is None else end.x
+    with stage(StageOptions.ending):
+        sample = outer.sampler.values(np.array(outer.problem.start), "at the start")[0]
+    return sample.joint if sample.feasible else None
 
 
 def _after_global_check(
@@ -220,12 +249,18 @@ def _after_global_check(
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
     if look.x is not None:
-        end = best_end([end, outer.polished(look.x)], outer.kkt_level, formulation.tolerance)
+        with stage(StageOptions.ending), suppress(NoDesign):
+            found = outer.polished(look.x)
+            end = best_end([end, found], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity
-    if outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level:
+    retried = outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level
+    if retried and not ends_early("perturbed start", GlobalCheckOptions.perturbed_starts):
         with outer.sampler.spent.on("polish"):
             starts = perturbed(outer, end.x, seed)
-        ends = [end, *map(outer.polished, starts)]
+        ends = [end]
+        for x in starts:
+            with suppress(NoDesign):
+                ends.append(outer.polished(x))
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible:
@@ -255,7 +290,7 @@ def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     spent = sampler.spent
     if search.end is None:
         return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
-    with spent.on("checks"):
+    with spent.on("checks"), stage(StageOptions.ending):
         verified = search.outer.verified(search.end, search.rounds)
     surrogates = tuple(recalibrated(process, terms.seed) for process in outcome.surrogates)
     outcome = replace(outcome, surrogates=surrogates)

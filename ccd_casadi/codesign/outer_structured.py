@@ -50,9 +50,10 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
+from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 from ccd_casadi.support.worker_process import alongside
 
 
@@ -109,7 +110,8 @@ class StructuredOuter(ThetaOuter):
         sampler = self.sampler
         if structured_of(sampler.problem).warm_starts:
             return self
-        problem, words = with_initial_search(sampler, seed)
+        with stage(StageOptions.start):
+            problem, words = with_initial_search(sampler, seed)
         sampler.count_multistart(sampler.hash)
         lost = words and not structured_of(problem).warm_starts
         return StructuredOuter(sampler.of(problem), words if lost else "")
@@ -158,11 +160,12 @@ class StructuredOuter(ThetaOuter):
             if found.design.controller is None:
                 at = dict(zip(problem.names, best.theta, strict=True))
                 words = f"no controller was found again at {at}: {found.design.words}"
-                raise UserError(f"{words}; give more controller.starts, or another --seed")
+                raise NoDesign(f"{words}; give more controller.starts, or another --seed")
             worst, scenarios = _worst_plants(sampler, best, found.design, options)
-            multistart = None if scenarios else multistart_at(sampler, best)
-            gap = np.nan if multistart is None else _gap(problem, best, multistart)
-            if multistart is None or not gap > enough:
+            over = scenarios or ends_early("multi-start check")
+            multistart = None if over else multistart_at(sampler, best)
+            gap = _gap(problem, best, multistart)
+            if multistart is None or not gap > enough or ends_early("polishing round"):
                 break
             sampler.value_from(best.theta, multistart.design.kappa.tolist())
             theta = np.array(best.theta)
@@ -187,7 +190,9 @@ class StructuredOuter(ThetaOuter):
         problem = sampler.problem
         design = recertified(problem, best.theta, design)  # what a store holds is not relied on
         on_box = DesignOnBox(problem, best.theta, design)
-        multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
+        multistart = end.multistart
+        if multistart is None and not ends_early("multi-start check"):
+            multistart = multistart_at(sampler, best)
         assert design.controller is not None
         loops = loops_of(problem, best.theta, design.controller)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
@@ -252,8 +257,10 @@ def _worst_plants(
     none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
     problem, tell = sampler.problem, printer("at the end", sampler.quiet)
     on_box = DesignOnBox(problem, best.theta, design)
-    worst, scenarios = on_box.worst(0, tell)
+    worst, scenarios = on_box.worst(0, tell, sampler.workers)
     if scenarios or not np.isfinite(objective_of(problem, best)):
+        return worst, scenarios
+    if ends_early("worst-plant check", options.searches):
         return worst, scenarios
     few = is_expensive(problem)
     count = options.searches_at_elements if few else options.searches
@@ -270,9 +277,12 @@ def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) ->
     return none_reaches(problem, theta, (least - objective(problem, theta, 0.0)) / problem.w2)
 
 
-def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:
-    """NaN where the search found no controller: nothing was set against the design."""
-    return problem.figure.gain(multistart.value, best.value) if multistart.feasible else np.nan
+def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue | None) -> float:
+    """NaN where the search found no controller, or was not made: nothing was set against the
+    design."""
+    if multistart is None or not multistart.feasible:
+        return np.nan
+    return problem.figure.gain(multistart.value, best.value)
 
 
 def polish_structured(

@@ -23,6 +23,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ def pieces_from(
     ended = [(bounds.shares(place.x), place.objective) for place in ends if place.stationary]
 
     def at(z: Array) -> Local | None:
+        if time_is_up():
+            return None
         asked.extend(sampler.values(bounds.point(z), "local solve"))
         return local(asked[-1])
 
@@ -123,6 +126,6 @@ def pieces_from(
             at, start, known, constraints, steps=steps, settled=settled, first=first, ended=ended
         )
         best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
-        if sampler.improvements == improvements:
+        if sampler.improvements == improvements or ends_early("local solve"):
             break
     return best

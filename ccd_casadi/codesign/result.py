@@ -36,6 +36,7 @@ from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
 from ccd_casadi.support.text import versions
+from ccd_casadi.support.time_budget import TimeBudget
 from surrogates import Quality, save
 from surrogates.files import write_whole
 
@@ -120,6 +121,44 @@ def result_dict(
         **move_entry(problem, verified.theta, verified.controller),
     }
     return json_values(result)
+
+
+def of_budget(
+    solution: Solution, spent: TimeBudget, seconds: Mapping[str, Any] | None = None
+) -> Solution:
+    """A solution as its time budget leaves it.
+
+    Where that ended a search nothing is known of the optimum: `optimal` and its checks are unknown,
+    and a design is verified without them.
+
+    Parameters
+    ----------
+    solution : Solution
+    spent : TimeBudget
+    seconds : mapping
+        Of the wall and of processors, by purpose.
+
+    Returns
+    -------
+    Solution
+        With `time_budget` and `phase_seconds` in its result.
+    """
+    own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
+    result, words = {**solution.result, **own}, spent.words
+    if words and "verdict" in result:
+        line = result["verdict"]["optimal"]
+        said = {"state": State.UNKNOWN.value, "words": f"{words}; {line['words']}"}
+        verdict = result["verdict"] = {**result["verdict"], "optimal": {**line, **said}}
+        unknown = dict.fromkeys(("inner_optimum", "optimality"))
+        checks = result["checks"] = {**result["checks"], **unknown}
+        lost = any(one["state"] == State.FAILED.value for one in verdict.values())
+        if not (lost or False in checks.values()):
+            result |= {"status": "verified", "reason": ""}
+    elif words:
+        result["reason"] = f"none found so far: {words}; {result['reason']}"
+    if words:
+        result["notes"] = [*result.get("notes", ()), words]
+    return replace(solution, result=result)
 
 
 def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:

@@ -5,6 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.controller_tables import OuterTable
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
@@ -20,6 +21,7 @@ from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter
+from ccd_casadi.codesign.result import infeasible_dict, of_budget
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
@@ -30,6 +32,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PoolOptions, Workers
+from ccd_casadi.support.time_budget import within_budget
 from ccd_casadi.support.worker_process import one_blas_thread
 
 
@@ -42,6 +45,7 @@ def solve(
     workers: int = 1,
     store: str | Path | None = None,
     quiet: bool = True,
+    budget: float | None = None,
 ) -> Solution:
     """Co-design the plant and its controller, verified on the true synthesis.
 
@@ -62,6 +66,9 @@ def solve(
         File of the samples, which a later call resumes from.
     quiet : bool
         Whether to show no progress on stderr.
+    budget : float, optional
+        Minutes of the search, which ends with the best design found in them; by default those of
+        the case, `OuterTable.minutes` of a problem.
 
     Returns
     -------
@@ -84,8 +91,9 @@ def solve(
     if isinstance(problem, Case):
         case, problem = problem, problem_of(problem)
         usual = formulation_of(case, usual_name(case, len(problem.names)))
+        minutes = case.outer.minutes
     else:
-        usual = usual_formulation(problem)
+        usual, minutes = usual_formulation(problem), OuterTable.minutes
     if workers > 1 and problem.source.given is not None:
         problem.source.given.require_found()
     with (
@@ -94,7 +102,27 @@ def solve(
         SampleStore(store or Path(folder) / "samples.sqlite") as samples,
     ):
         sampler = Sampler(problem, samples, pool, quiet=quiet)
-        return co_design(sampler, formulation or usual, seed)
+        return within(budget or minutes, sampler, formulation or usual, seed)
+
+
+def within(minutes: float, sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
+    """`co_design` within a time budget: the best design found in these minutes, judged.
+
+    Parameters
+    ----------
+    minutes : float
+        After which nothing more is searched.
+    sampler, formulation, seed : Sampler, Formulation, int
+        As of `co_design`.
+
+    Returns
+    -------
+    Solution
+        Its result says whether the budget ended it, and what was not searched.
+    """
+    with within_budget(minutes) as spent:
+        found = co_design(sampler, formulation, seed)
+        return of_budget(found, spent, sampler.spent.seconds())
 
 
 def co_design(
@@ -200,11 +228,16 @@ def require_solvable(problem: CoDesignProblem) -> None:
 
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
     """A co-design with parameters from lists: local searches near by where its kind knows how."""
+    terms = RunTerms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     if isinstance(sampler.problem.controller, StructuredProblem):
         of = ListedStructured(
             formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
         )
-        return best_of_lists(sampler, of.search, of.search, of.judge)
+        best = best_of_lists(sampler, of.search, of.search, of.judge)
+        if best.verified is None:  # a search near by knows nothing of the run
+            whole = infeasible_dict(terms, best.result["reason"], sampler.spent.by_purpose)
+            best = replace(best, result={**whole, "listed": best.result["listed"]})
+        return best
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box
     return best_of_lists(
         sampler,

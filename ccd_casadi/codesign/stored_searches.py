@@ -56,7 +56,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
     def searched() -> InitialSearch:
         tell = printer("search at the start", sampler.quiet)
         anchored, made, _ = prepared(problem, tell, sampler.workers)
-        anchored, made, _ = least_from(anchored, problem.start, made, tell)
+        anchored, made, _ = least_from(anchored, problem.start, made, tell, sampler.workers)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
@@ -87,11 +87,13 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     StructuredValue
         With all local optima of its design.
     """
-    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
+    problem, theta = sampler.problem, best.theta
+    if best.kappa:
+        problem = with_warm_start(problem, best.kappa)
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
-        found = ProblemAt(problem, theta).value_of(made, 1)
+        found = ProblemAt(problem, theta).value_of(made, 1, workers=sampler.workers)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
     sampler.count_multistart(sample_key(sampler.hash, theta))

@@ -32,6 +32,7 @@ from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 Report = Callable[[str], None] | None
 
@@ -165,7 +166,7 @@ class JointState:
             options.model,
         )  # fmt: skip
         found = self.working.sampler.cached(kind, key, Proposal, make)
-        if report is not None:
+        if report is not None and np.isfinite(self.objective):
             digits, step = ("6", "step") if least_gain is None else ("8", "last step")
             gain = max(found.gain, 0.0)
             report(f"J {self.objective:.{digits}g}, predicted gain of a {step} {gain:.2g}")
@@ -237,6 +238,8 @@ def joint_search(
     )  # fmt: skip
     settles = options.model.settled
     for turn in range(options.rounds):
+        if ends_early("joint round"):
+            break
         excess = options.excess_on_way if turn else WorstPlantOptions.within
         state = state.with_worse_plants(
             state.plants.models, (turn,), excess, report, options, options.lattice_on_way
@@ -269,7 +272,7 @@ def joint_search(
         if settled:
             break
         state = replace(state, plants=Around.of(problem, state.point))
-    if not (settled or ends is not None):
+    if not (settled or ends is not None or time_is_up()):
         state, _ = with_last_steps(state, options.final_seed, report, options)
     counted = structured_of(state.problem).scenarios
     worse = set(counted) - set(structured_of(problem).scenarios)
@@ -290,7 +293,7 @@ def _after_poll(
     plants = Around.of(problem, place)
     other = replace(state, point=place, plants=plants, reach=options.first_reach)
     other = other.with_worse_plants(plants.models, (turn,), options.excess_on_way, report, options)
-    if report is not None:
+    if report is not None and np.isfinite(other.objective):
         away = f"{options.poll_step:g} of the box away along one axis"
         report(f"J {other.objective:.6g} at the best place {away}")
     return other
@@ -361,6 +364,8 @@ def with_last_steps(
     plants = state.plants.at(state.problem, state.point, options.basis_reach)
     state = replace(state, plants=plants).adapted(options)
     for step in range(1, options.final_steps):
+        if ends_early("last joint step"):
+            break
         key = (*state.point.theta, state.point.bandwidth, state.reach, curved)
         proposal = state.proposal("finished", key, options.final_least_gain, report, options)
         J, coarse = state.objective, proposal.gain > options.basis_gain * abs(state.objective)

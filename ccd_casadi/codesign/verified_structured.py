@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -71,8 +72,8 @@ class VerifiedStructured(Verified):
     ----------
     design : SectionsDesign
         Certified anew on its set.
-    multistart : StructuredValue
-        A multi-start search at θ.
+    multistart : StructuredValue or None
+        A multi-start search at θ; None where the time was up for one.
     wide, checked : SetCertificate, int
         The judge's certificate on a lattice of this number of plants of the box.
     proof : Proof
@@ -94,7 +95,7 @@ class VerifiedStructured(Verified):
     """
 
     design: SectionsDesign
-    multistart: StructuredValue
+    multistart: StructuredValue | None
     wide: SetCertificate
     checked: int
     proof: Proof
@@ -146,7 +147,7 @@ class VerifiedStructured(Verified):
             "surrogate_bandwidth_hz": predicted / HZ if structured.figure is BANDWIDTH else None,
             "race": [
                 {"bandwidth_hz": optimum.bandwidth / HZ, "searches": optimum.count}
-                for optimum in self.multistart.design.local_optima
+                for optimum in self.optima
             ],
             "rounds": self.rounds,
             "anchors": [list(kappa) for kappa in structured.warm_starts],
@@ -161,7 +162,7 @@ class VerifiedStructured(Verified):
             found |= {
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
-                f"{entry}_raced": self.multistart.value,
+                f"{entry}_raced": None if self.multistart is None else self.multistart.value,
                 "error_anchors": [list(kappa) for kappa in structured.error_warm_starts],
             }
         if structured.uncertainty.ranges:
@@ -219,7 +220,14 @@ class VerifiedStructured(Verified):
         return box_words(self.wide, self.checked, self.proof, self.worst, self.drawn,
                          along=self.along)  # fmt: skip
 
+    @property
+    def optima(self) -> tuple[BandwidthOptimum, ...]:
+        """Where the multi-start search at θ ended."""
+        return () if self.multistart is None else self.multistart.design.local_optima
+
     def gap_words(self) -> str:
+        if self.multistart is None:
+            return ""
         figure = self.problem.figure
         here, there = figure.shown(self.value), figure.shown(self.multistart.value)
         return (
@@ -239,7 +247,9 @@ class VerifiedStructured(Verified):
         self, outcome: FormulationResult, look: GlobalCheck | None
     ) -> tuple[str, Mapping[str, Any]]:
         known, figures = super().searched(outcome, look)
-        found, of = [optimum.bandwidth / HZ for optimum in self.multistart.design.local_optima], ""
+        if self.multistart is None:
+            return known, figures
+        found, of = [optimum.bandwidth / HZ for optimum in self.optima], ""
         if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
         words = f"{multistart_words(found)}{of}"

@@ -99,7 +99,16 @@ class WorkingSet:
             problem, known = sampler.problem, [model(best.theta) for model in models]
             uncertain, kappa = uncertain_plant(problem, best.theta, known), np.array(best.kappa)
             scenarios = violations(
-                problem, uncertain, kappa, best.bandwidth, seed, report, within, aside, count
+                problem,
+                uncertain,
+                kappa,
+                best.bandwidth,
+                seed,
+                report,
+                within,
+                aside,
+                count,
+                workers=sampler.workers,
             )[1]
             if scenarios:
                 sampler = with_scenarios(sampler, scenarios)

@@ -37,6 +37,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import NotebookHtml, Tell, silent
 from ccd_casadi.support.text import HZ, number
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 
 @dataclass(frozen=True)
@@ -323,6 +324,8 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     found, batch = arrivals(first, runners[0], rules) - max(known - 1, 0), 0
     least = min(options.least_starts, search.most_starts)
     while begun < least or (found < options.repeats and begun + starts <= search.most_starts):
+        if ends_early("controller start", starts):
+            break
         batch += 1
         rng = np.random.default_rng((search.seed, batch))
         pool = _pool(problem, starts, rng, workers, options)
@@ -344,6 +347,8 @@ def _reworked(
     that helps, beside those of before."""
     workers, tried, options = search.workers, list[Point](), search.options
     for _ in range(options.reworks):
+        if time_is_up():
+            break
         best = runners[0].merit
         ends = distinct(runners, options.reworked, options.multi_start)
         fresh = [end for end in ends if not any(end is other for other in tried)]

@@ -13,6 +13,7 @@ bandwidth, so that ω_b is what the bounds leave free at this κ. At its end
 but for that payment, `reward` dτ/dθ.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,6 +34,7 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.local_search import (
     Envelope,
+    LocalSearchOptions,
     LoopModel,
     Optimality,
     Point,
@@ -40,7 +42,7 @@ from ccd_casadi.fixed_structure.local_search import (
     envelope_of,
     optimality,
 )
-from ccd_casadi.fixed_structure.loop_problem import Assessment
+from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -48,8 +50,10 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
+from ccd_casadi.support.time_budget import ends_early
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class LeastValueOptions:
     reward: float = 1e-6  # of ln ω_b in ln v
     inside: float = 0.7  # of the ω_b that its bounds leave a given κ: from a bound a search crawls
     kept: float = 1.0 + 2e-6  # figure over bound that the search leaves
+    at_once: int = 2  # descents: none of them knows where the others end
 
 
 class Goal(Protocol):
@@ -172,6 +177,7 @@ def least_value(
     initial: Sequence[Array] = (),
     only_initial: bool = False,
     tell: Tell = silent,
+    workers: Pool | None = None,
     options: LeastValueOptions = LeastValueOptions(),
 ) -> LeastValue:
     """Search the least value of a goal within the bounds, from a certified design.
@@ -189,6 +195,8 @@ def least_value(
         where these lead to no certified design.
     tell : callable
         Is given a line for each end.
+    workers : Pool, optional
+        With it descents are made `options.at_once`, however many its processes are.
     options : LeastValueOptions
 
     Returns
@@ -206,50 +214,94 @@ def least_value(
         raise ValueError("the least value is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
     search = DesignSearch(problem, plants, sampling)
-    w0, force = problem.plants.omega_0, problem.plants.force
+    w0 = problem.plants.omega_0
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
 
-    def scaled(kappa: Array) -> tuple[float, Array]:
-        return goal.at(structure.in_units(kappa, w0, force))
-
-    model = LoopModel(problem, scaled, options.reward, floor)
-    first_hessian = np.diag(np.append(np.ones(len(design.kappa)), 0.0))
+    descent = _Descent(problem, goal, options.reward, floor)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
     first = float(np.exp(goal.at(design.kappa)[0]))
     best = LeastValue(design, first, first, 0, None)
-    steps = 0
-    given = [(np.inf, tuple(map(float, item))) for item in initial]
-    for bandwidth, kappa in [*given, own, *others]:
-        if only_initial and (bandwidth, kappa) == own and best.design is not design:
+    steps, known = 0, list[Array]()
+    left = deque([*((np.inf, tuple(map(float, item))) for item in initial), own, *others])
+    at_once = 1 if workers is None else options.at_once
+    while left:
+        begins: list[Array] = []
+        while left and len(begins) < at_once:
+            bandwidth, kappa = left[0]
+            if only_initial and (bandwidth, kappa) == own:
+                if begins:
+                    break  # whether it counts depends on the end of those before
+                if best.design is not design:
+                    left.clear()
+                    break
+            left.popleft()
+            if bandwidth < least_bandwidth:
+                continue
+            begin = in_problem_units(problem, np.array(kappa))
+            tau = float(np.log(bandwidth / w0))
+            if np.isinf(tau):
+                own_tau = at_its_bandwidth(problem, begin).tau
+                tau = max(own_tau + float(np.log(options.inside)), floor)
+            begins.append(np.append(begin, tau))
+        if best.design is not design and ends_early("least-value start", len(begins)):
             break
-        if bandwidth < least_bandwidth:
-            continue
-        begin = in_problem_units(problem, np.array(kappa))
-        tau = float(np.log(bandwidth / w0))
-        if np.isinf(tau):
-            own_tau = at_its_bandwidth(problem, begin).tau
-            tau = max(own_tau + float(np.log(options.inside)), floor)
-        start = model.at(np.append(begin, tau))
-        if start is None or model.is_known(start.x):
-            continue
-        end, count = descend(model, start, first_hessian, problem.margin)
-        steps += count
-        new = not model.is_known(end.x)
-        model.known += [start.x, end.x]
-        if not new:
-            continue
-        made, conditions = _judged(search, end, design, floor, options.kept)
-        value = float(np.exp(end.value + options.reward * end.x[-1]))
-        at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
-        tell(f"{at}, {count} steps: {made.words}")
-        if made.certified and value < best.value:
-            direct = goal.to_theta(made.kappa)
-            envelope = envelope_of(problem, end.x[:-1], conditions, direct)
-            if envelope is not None:
-                envelope = envelope.times(value)
-            best = replace(best, design=made, value=value, envelope=envelope)
+        tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
+        ends = dict(results(workers, _descended, tasks))
+        for i in range(len(begins)):
+            start, end, count = ends[i]
+            if start is None or end is None or _is_known(known, start):
+                continue
+            steps += count
+            new = not _is_known(known, end.x)
+            known += [start, end.x]
+            if not new:
+                continue
+            made, conditions = _judged(search, end, design, floor, options.kept)
+            value = float(np.exp(end.value + options.reward * end.x[-1]))
+            at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
+            tell(f"{at}, {count} steps: {made.words}")
+            if made.certified and value < best.value:
+                direct = goal.to_theta(made.kappa)
+                envelope = envelope_of(problem, end.x[:-1], conditions, direct)
+                if envelope is not None:
+                    envelope = envelope.times(value)
+                best = replace(best, design=made, value=value, envelope=envelope)
     return replace(best, steps=steps)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """What a descent of a goal needs, in any process."""
+
+    problem: LoopProblem
+    goal: Goal
+    reward: float
+    floor: float
+
+    def scaled(self, kappa: Array) -> tuple[float, Array]:
+        """ln v and its gradient at κ in the problem's units."""
+        units = self.problem.plants
+        return self.goal.at(self.problem.structure.in_units(kappa, units.omega_0, units.force))
+
+
+def _descended(
+    descent: _Descent, x: Array, known: Sequence[Array]
+) -> tuple[Array | None, Iterate[Assessment] | None, int]:
+    """From x to where steps no longer help, or come to what is known: the start as it is, the end,
+    and how many loops were assessed; none of a start that is known or not stable."""
+    model = LoopModel(descent.problem, descent.scaled, descent.reward, descent.floor)
+    model.known = list(known)
+    start = model.at(x)
+    if start is None or model.is_known(start.x):
+        return None, None, 0
+    first_hessian = np.diag(np.append(np.ones(len(x) - 1), 0.0))
+    end, count = descend(model, start, first_hessian, descent.problem.margin)
+    return start.x, end, count
+
+
+def _is_known(known: Sequence[Array], x: Array) -> bool:
+    return any(np.abs(x - other).max() <= LocalSearchOptions.merged for other in known)
 
 
 def _judged(

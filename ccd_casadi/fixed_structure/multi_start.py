@@ -21,6 +21,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import number
+from ccd_casadi.support.time_budget import ends_early
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,8 @@ def run_race(
         running = [runner for runner in field if runner.running]
         alone = len(running) == 1 and turn > 0 and running[0].gained < options.same
         if not running or (alone and not last):
+            break
+        if turn > 0 and ends_early("controller search round"):
             break
         others = [runner for runner in field if not runner.running]
         field = others + _climbed(problem, running, workers, options)

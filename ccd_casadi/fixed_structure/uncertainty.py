@@ -37,6 +37,10 @@ from ccd_casadi.support.arrays import Array
 SLOPES = ("dM", "dK", "dD", "dB", "dC")  # of a modal plant
 
 
+def no_graph(option: int) -> None:
+    """The modes of no option are known as functions of what varies."""
+
+
 @dataclass(frozen=True)
 class UncertainPlant:
     """The plants off their model: a box of parameters for each of some options.
@@ -69,7 +73,7 @@ class UncertainPlant:
     gain: float = 0.0
     ranges: tuple[tuple[str, float, float, float], ...] = ()
     along: Callable[[int, Array], Mechanics] | None = None
-    graph: Callable[[int], ca.Function | None] = lambda option: None
+    graph: Callable[[int], ca.Function | None] = no_graph
     rigid_modes: int | None = None
 
     @cached_property

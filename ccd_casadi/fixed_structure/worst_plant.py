@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, results
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,11 @@ class WorstPlantOptions:
     ----------
     within : float
         By how much a plant of the box may exceed a bound and count as within.
+    along, along_first : int
+        Points along each parameter of the model that varies, and of a first look: only where that
+        finds no plant beyond its bounds all of them are assessed.
+    batch : int
+        Plants that are assessed together.
     few : int
         Parameters up to which every one is moved separately: a compass search.
     lattice, searches, rounds : int
@@ -45,6 +51,9 @@ class WorstPlantOptions:
     """
 
     within: float = 1e-4
+    along: int = 61
+    along_first: int = 16
+    batch: int = 48
     few: int = 4
     lattice: int = 200
     searches: int = 6
@@ -121,9 +130,12 @@ class LoopOnBox:
     bounds: Bounds
     sampling: Sampling | None = None
 
-    def excesses(self, points: Sequence[tuple[int, Array]]) -> Array:
-        """The largest c of the loop with every plant."""
-        return self.assessed(self.uncertain.plants(points)).largest
+    def excesses(self, points: Sequence[tuple[int, Array]], workers: Pool | None = None) -> Array:
+        """The largest c of the loop with every plant, some of them at a time."""
+        size = WorstPlantOptions.batch
+        parts = {i: (self, points[i : i + size]) for i in range(0, len(points), size)}
+        found = dict(results(workers, _largest, parts))
+        return np.concatenate([found[i] for i in parts])
 
     def assessed(self, plants: Sequence[ScaledPlant]) -> Loops:
         """The loops with these plants."""
@@ -139,6 +151,10 @@ class LoopOnBox:
         grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
         largest = np.where(grown < 0.0, largest, self.unstable + np.maximum(grown, 0.0))
         return Loops(problem, kappa, largest, rows, plant, curve, log_omega, value)
+
+
+def _largest(loop: LoopOnBox, points: Sequence[tuple[int, Array]]) -> Array:
+    return loop.assessed(loop.uncertain.plants(points)).largest
 
 
 def meetings(
@@ -303,7 +319,7 @@ def _moved(
 
 
 def lattice(
-    uncertain: UncertainPlant, count: int, seed: int, *, along: int = 61
+    uncertain: UncertainPlant, count: int, seed: int, *, along: int = WorstPlantOptions.along
 ) -> list[tuple[int, Array]]:
     """Spread plants over the box: corners, lines along ranges, and a Latin hypercube.
 
@@ -343,7 +359,8 @@ def lattice(
 
 def worst_plants(
     loop: LoopOnBox, seed: int = 0, count: int = WorstPlantOptions.lattice,
-    options: WorstPlantOptions = WorstPlantOptions(),
+    options: WorstPlantOptions = WorstPlantOptions(), workers: Pool | None = None,
+    along: int = WorstPlantOptions.along,
 ) -> tuple[list[Excess], int]:  # fmt: skip
     """Search the worst plants of a box.
 
@@ -355,7 +372,9 @@ def worst_plants(
     loop, seed : LoopOnBox, int
     count : int
         Plants of the lattice, of many parameters `options.lattice_of_many` at most.
-    options : WorstPlantOptions
+    options, workers : WorstPlantOptions, Pool
+    along : int
+        As of `lattice`.
 
     Returns
     -------
@@ -366,11 +385,11 @@ def worst_plants(
     """
     uncertain, n = loop.uncertain, len(loop.uncertain.names)
     if n > options.few:
-        points = lattice(uncertain, min(count, options.lattice_of_many), seed)
+        points = lattice(uncertain, min(count, options.lattice_of_many), seed, along=along)
         points = _sharp(uncertain, points, options.damped_every)
         return climbed(loop, [*points, *meetings(uncertain)], options)
-    points = lattice(uncertain, count, seed)
-    value = loop.excesses(points)
+    points = lattice(uncertain, count, seed, along=along)
+    value = loop.excesses(points, workers)
     looked, first = len(points), np.argsort(-value)[: options.searches]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
@@ -386,7 +405,8 @@ def worst_plants(
         ]
         # At an end of the box half of them lead nowhere.
         moves = [(row, point) for row, point in moves if (point != heads[row].point).any()]
-        ends = loop.excesses([(heads[row].option, point) for row, point in moves]).tolist()
+        places = [(heads[row].option, point) for row, point in moves]
+        ends = loop.excesses(places, workers).tolist()
         for (row, point), end in zip(moves, ends, strict=True):
             if end > heads[row].value:
                 heads[row] = Excess(heads[row].option, point, end)

@@ -37,6 +37,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.time_budget import time_is_up
 
 
 @dataclass(frozen=True)
@@ -229,7 +230,11 @@ class ProblemAt:
         return MoveTime(tuple(self.plants), structure, sampling, motion_of(problem, self.theta))
 
     def least(
-        self, design: SectionsDesign, only_initial: bool = False, tell: Tell = silent
+        self,
+        design: SectionsDesign,
+        only_initial: bool = False,
+        tell: Tell = silent,
+        workers: Pool | None = None,
     ) -> LeastValue:
         """The least of the problem's figure from a certified design and its warm starts."""
         problem, structured = self.problem, structured_of(self.problem)
@@ -239,11 +244,15 @@ class ProblemAt:
             self.plants, bounds, design, self.goal, sampling=structured.sampling,
             least_bandwidth=structured.bandwidth_least,
             initial=warm_starts_at(started, structure_of(problem), self.plants, bounds),
-            only_initial=only_initial, tell=tell,
+            only_initial=only_initial, tell=tell, workers=workers,
         )  # fmt: skip
 
     def value_of(
-        self, design: SectionsDesign, spent: int, only_initial: bool = False
+        self,
+        design: SectionsDesign,
+        spent: int,
+        only_initial: bool = False,
+        workers: Pool | None = None,
     ) -> StructuredValue:
         """A design of largest bandwidth as a value of ω_b*(θ), or as a start to the least of
         another figure beside the warm starts; with `only_initial` where these lead to no certified
@@ -253,7 +262,7 @@ class ProblemAt:
         if problem.figure is not BANDWIDTH:
             design = too_slow(problem, design)
         if design.certified and problem.figure is not BANDWIDTH:
-            found = self.least(design, only_initial)
+            found = self.least(design, only_initial, workers=workers)
             design, error, envelope = found.design, found.value, found.envelope
         elif design.certified:
             bounds = bounds_of(problem)
@@ -302,13 +311,15 @@ def structured_value(
         spent += 1
     limit = OptimalityOptions.residual
     while made.certified and made.kkt_residual > limit and spent < options.searches:
+        if time_is_up():
+            break
         again = here.searched([made.kappa], workers=workers)
         spent += 1
         kept = (1.0 - options.rounding) * made.bandwidth
         if not again.certified or again.bandwidth < kept:
             break
         made = again
-    return here.value_of(made, spent, only_initial=True)
+    return here.value_of(made, spent, only_initial=True, workers=workers)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:

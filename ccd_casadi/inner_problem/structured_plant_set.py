@@ -3,7 +3,8 @@ the warm starts as starts there.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -23,7 +24,14 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
-from ccd_casadi.plants.plant import Evaluate, FromExpressions, Mechanics, mechanics, nearby_model
+from ccd_casadi.plants.plant import (
+    Evaluate,
+    FromExpressions,
+    Mechanics,
+    Plant,
+    mechanics,
+    nearby_model,
+)
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -152,6 +160,35 @@ def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
     return [with_options(problem, options) for options in ((), *given)]
 
 
+@dataclass(frozen=True)
+class Ranged:
+    """The plants of a problem at θ over the ranges of parameters that vary, for any process."""
+
+    problem: CoDesignProblem
+    theta: tuple[float, ...]
+
+    @cached_property
+    def wider(self) -> list[Plant]:
+        """Those of every option, over θ and what varies."""
+        return [plant_of(with_ranges(option)) for option in _options(self.problem)]
+
+    def __getstate__(self) -> dict[str, object]:
+        return {"problem": self.problem, "theta": self.theta}
+
+    def along(self, option: int, values: Array) -> Mechanics:
+        """The matrices of an option at values of what varies."""
+        return mechanics(self.wider[option], (*self.theta, *values.tolist()))
+
+    def graph(self, option: int) -> ca.Function | None:
+        """The same as a function, where the plant is one."""
+        count = len(structured_of(self.problem).uncertainty.ranges)
+        evaluate, x = self.wider[option].evaluate, ca.SX.sym("x", count)
+        if not isinstance(evaluate, FromExpressions):
+            return None
+        theta = ca.vertcat(*self.theta, x)
+        return ca.Function("graph", [x], evaluate.matrices.call([theta])[:5])
+
+
 def uncertain_plant(
     problem: CoDesignProblem, theta: Sequence[float], known: Sequence[Mechanics] = ()
 ) -> UncertainPlant:
@@ -168,22 +205,12 @@ def uncertain_plant(
     UncertainPlant
     """
     u, held = structured_of(problem).uncertainty, problem.source.held
-    options = _options(problem)
-    wider = [plant_of(with_ranges(option)) for option in options]
-
-    def along(option: int, values: Array) -> Mechanics:
-        return mechanics(wider[option], (*theta, *values.tolist()))
-
-    def graph(option: int) -> ca.Function | None:
-        evaluate, x = wider[option].evaluate, ca.SX.sym("x", len(u.ranges))
-        if not isinstance(evaluate, FromExpressions):
-            return None
-        return ca.Function("graph", [x], evaluate.matrices.call([ca.vertcat(*theta, x)])[:5])
-
+    own = Ranged(problem, tuple(map(float, theta)))
     return UncertainPlant(
-        tuple(known) or tuple(mechanics(plant_of(option), theta) for option in options),
+        tuple(known) or tuple(mechanics(plant_of(option), theta) for option in _options(problem)),
         problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
-        tuple((name, low, held[name], high) for name, low, high in u.ranges), along, graph,
+        tuple((name, low, held[name], high) for name, low, high in u.ranges),
+        own.along, own.graph,
         problem.suspension.rigid_modes,
     )  # fmt: skip
 

@@ -99,7 +99,9 @@ class DesignOnBox:
         """The plants of the box at θ."""
         return uncertain_plant(self.problem, self.theta)
 
-    def worst(self, turn: int = 0, tell: Tell = silent) -> tuple[Excess, tuple[Scenario, ...]]:
+    def worst(
+        self, turn: int = 0, tell: Tell = silent, workers: Pool | None = None
+    ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of the box, and those to add: past a bound, each a new one.
 
         Where a move's time counts the plant that settles latest besides, if it is later than v.
@@ -107,7 +109,7 @@ class DesignOnBox:
         problem, theta, design = self.problem, self.theta, self.design
         worst, found = violations(
             problem, self.uncertain, design.kappa, design.bandwidth, turn, tell,
-            options=self.options,
+            options=self.options, workers=workers,
         )  # fmt: skip
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
@@ -228,6 +230,7 @@ def violations(
     others: Sequence[Scenario] = (),
     count: int = WorstPlantOptions.lattice,
     options: BoxCheckOptions = BoxCheckOptions(),
+    workers: Pool | None = None,
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """Search the worst plant of a box for a controller.
 
@@ -244,7 +247,7 @@ def violations(
         ln of a bound, above which a plant violates it.
     others : sequence of (option, point)
         Known plants, which are tried besides.
-    options : BoxCheckOptions
+    options, workers : BoxCheckOptions, Pool
 
     Returns
     -------
@@ -257,24 +260,33 @@ def violations(
                      structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
     tried = loop.excesses(known).tolist() if known else []
-    heads, count = worst_plants(loop, structured.seed + turn, count)
-    heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
-    heads.sort(key=lambda head: -head.value)
+    lines, width = WorstPlantOptions(), uncertain.box[1] - uncertain.box[0]
+    before = [Excess(*one, value) for one, value in zip(known, tried, strict=True)]
+
+    def fresh(heads: Sequence[Excess]) -> tuple[Scenario, ...]:
+        found: list[Scenario] = []
+        for head in heads:
+            near = [
+                float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
+                for option, point in (*structured.scenarios, *found)
+                if option == head.option
+            ]
+            apart = not near or min(near) > options.apart
+            if head.value > within and apart and len(found) < options.added:
+                found.append((head.option, tuple(map(float, head.point))))
+        return tuple(found)
+
+    looked = 0
+    for along in (lines.along_first, lines.along) if uncertain.ranges else (lines.along,):
+        seed = structured.seed + turn
+        heads, more = worst_plants(loop, seed, count, workers=workers, along=along)
+        heads, looked = sorted([*before, *heads], key=lambda head: -head.value), looked + more
+        worse = fresh(heads)
+        if worse:
+            break
     if tell is not None:
-        tell(f"{of_a_bound(heads[0].value)} at most on {count} plants")
-    width = uncertain.box[1] - uncertain.box[0]
-    counted = structured.scenarios
-    found: list[Scenario] = []
-    for head in heads:
-        near = [
-            float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
-            for option, point in (*counted, *found)
-            if option == head.option
-        ]
-        apart = not near or min(near) > options.apart
-        if head.value > within and apart and len(found) < options.added:
-            found.append((head.option, tuple(map(float, head.point))))
-    return heads[0], tuple(found)
+        tell(f"{of_a_bound(heads[0].value)} at most on {looked} plants")
+    return heads[0], worse
 
 
 def recertified(

@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def race(
     starts = None if only_warm_starts else structured.starts
     made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
     least = options.least_starts
-    if made.certified or starts is None or starts >= least:
+    if made.certified or starts is None or starts >= least or ends_early("controller start", least):
         return made
     return here.searched(warm_starts, least, options.most_starts, tell, workers)
 
@@ -149,7 +150,9 @@ def prepared(
     worst: Excess | None = None
     last = True  # a search that ended off its optimum continues once no plant is found worse
     for turn in range(options.rounds if made.certified else 0):
-        worst, wider = _wider(problem, problem.start, made, turn, tell)
+        if ends_early("worst-plant check"):
+            break
+        worst, wider = _wider(problem, problem.start, made, turn, tell, workers)
         if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
         last = wider is None
@@ -168,10 +171,10 @@ def prepared(
 
 def _wider(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, turn: int,
-    tell: Tell,
+    tell: Tell, workers: Pool | None = None,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = DesignOnBox(problem, theta, design).worst(turn, tell)
+    worst, found = DesignOnBox(problem, theta, design).worst(turn, tell, workers)
     scenarios = (*structured_of(problem).scenarios, *found)
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 
@@ -208,14 +211,14 @@ def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) ->
 
 def least_from(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, tell: Tell = silent,
-    options: StructuredSearchOptions = StructuredSearchOptions(),
+    workers: Pool | None = None, options: StructuredSearchOptions = StructuredSearchOptions(),
 ) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:  # fmt: skip
     """Search the least of the problem's figure from a design of largest bandwidth.
 
     Parameters
     ----------
     problem, theta, design : CoDesignProblem, sequence of float, SectionsDesign
-    tell : callable
+    tell, workers : callable, Pool, optional
     options : StructuredSearchOptions
 
     Returns
@@ -232,8 +235,10 @@ def least_from(
     wider = problem
     for turn in range(options.rounds_of_least):
         problem = wider
-        found = ProblemAt(problem, theta).least(design, tell=tell)
-        wider = _wider(problem, theta, found.design, turn, tell)[1] or problem
+        found = ProblemAt(problem, theta).least(design, tell=tell, workers=workers)
+        if time_is_up():
+            break
+        wider = _wider(problem, theta, found.design, turn, tell, workers)[1] or problem
         if wider is problem:
             break
     return with_warm_start(problem, found.design.kappa), found.design, found

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -12,24 +13,53 @@ from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.sampling.store import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import restored
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 class SynthesisCounts:
-    """Counts of true syntheses; `purpose` is what is being done."""
+    """Counts of true syntheses, and times; `purpose` is what is being done.
 
-    def __init__(self) -> None:
-        self.purpose = "samples"
+    Parameters
+    ----------
+    workers : Pool, optional
+        Whose processor time counts beside this process's.
+
+    Attributes
+    ----------
+    told : float
+        The least J that was reported as the best so far.
+    """
+
+    def __init__(self, workers: Pool | None = None) -> None:
+        self.purpose, self.told = "samples", np.inf
         self._units: dict[str, tuple[str, int]] = {}
+        self._workers, self._seconds = workers, dict[str, Array]()
+        self._since = self._clocks()
+
+    def _clocks(self) -> Array:
+        beside = getattr(self._workers, "processor_seconds", 0.0)
+        return np.array([perf_counter(), process_time() + beside])
+
+    def seconds(self) -> dict[str, dict[str, float]]:
+        """Of the wall and of processors, workers' included, by purpose, up to now."""
+        now = self._clocks()
+        before = self._seconds.get(self.purpose, np.zeros(2))
+        self._seconds[self.purpose] = before + now - self._since
+        self._since = now
+        return {name: dict(zip(("wall", "processor"), np.round(own, 3).tolist(), strict=True))
+                for name, own in self._seconds.items()}  # fmt: skip
 
     @contextmanager
     def on(self, purpose: str) -> Iterator[None]:
         """Count the syntheses inside for this purpose."""
+        self.seconds()
         before, self.purpose = self.purpose, purpose
         try:
             yield
         finally:
+            self.seconds()
             self.purpose = before
 
     def once(self, unit: str, count: int) -> bool:
@@ -124,6 +154,11 @@ class InnerSample(InnerValue):
     kappa: tuple[float, ...] = ()
 
     @property
+    def searched(self) -> bool:
+        """Whether the inner problem was solved there: the time was not up before."""
+        return self.syntheses > 0
+
+    @property
     def x(self) -> tuple[float, ...]:
         """What a surrogate of it is over: θ."""
         return self.theta
@@ -211,6 +246,31 @@ def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
     if len(gradient) != len(theta) or not all(0.0 < size < np.inf for size in sizes):
         raise ValueError("a stored result holds what none is made of")
     return sample
+
+
+def unsearched(theta: tuple[float, ...]) -> InnerSample:
+    """What is known at a θ that was not searched, since the time was up.
+
+    Parameters
+    ----------
+    theta : tuple of float
+        SI.
+
+    Returns
+    -------
+    InnerSample
+        Not feasible.
+    """
+    nothing = dict.fromkeys(("bandwidth", "gradient", "omega_S", "omega_T", "violation"))
+    words = "the time budget ended before this theta was searched"
+    own = {"active": [], "shortfall": words, "syntheses": 0}
+    return inner_sample(theta, nothing | own)
+
+
+def unsearched_quantities(x: tuple[float, ...], inner: InnerBounds) -> QuantitySample:
+    """The same of a synthesis at x = (θ, ln ω_S, ln ω_T) that was not made."""
+    count = 2 + len(inner.bounds)
+    return QuantitySample(x, np.full(count, np.nan), np.full((count, len(x)), np.nan), False)
 
 
 def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerBounds) -> QuantitySample:

@@ -21,6 +21,8 @@ from ccd_casadi.sampling.inner_samples import (
     inner_sample,
     quantity_sample,
     sample_of,
+    unsearched,
+    unsearched_quantities,
 )
 from ccd_casadi.sampling.sample_keys import best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.store import Sample, SampleStore
@@ -30,11 +32,13 @@ from ccd_casadi.sampling.units import (
     from_neighbour,
     inner_unit,
     promising_starts,
+    timed,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress, remark
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.time_budget import not_searched, time_is_up
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 T = TypeVar("T")
@@ -103,7 +107,7 @@ class Sampler:
         self.quiet = quiet
         self.hash, self.inner_hash = hashes_of(problem)
         store.put_problem(self.hash, problem.identity())
-        self.spent = SynthesisCounts()
+        self.spent = SynthesisCounts(workers)
         self.trace: list[TraceEntry] = []
         self.nearest: InnerSample | None = None
         self.solved: dict[tuple[float, ...], InnerSample] = {}
@@ -139,19 +143,20 @@ class Sampler:
         """ω_b* at every row of `thetas`, in their order: the best that is known there.
 
         Of fixed structures a new θ begins from what is known near by too, and what falls short of
-        its neighbours is climbed anew (`neighbours`).
+        its neighbours is climbed anew (`neighbours`). Where the time is up those that are left are
+        `unsearched`.
         """
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
         known = list(self.solved.values())
         new = [theta for theta in points if theta not in self.solved]
         self._learn({theta: from_neighbour(self.problem, known, theta) for theta in new}, label)
-        return [self.solved[theta] for theta in points]
+        return [self.solved.get(theta) or unsearched(theta) for theta in points]
 
     def value_from(self, theta: Sequence[float], kappa: Sequence[float]) -> InnerSample:
         """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
         point = tuple(float(v) for v in theta)
         self._learn({point: from_controller(self.problem, kappa)}, "from a controller")
-        return self.solved[point]
+        return self.solved.get(point) or unsearched(point)
 
     def latest(self, samples: Sequence[InnerSample]) -> list[InnerSample]:
         """What is known by now at the θ of samples."""
@@ -163,6 +168,8 @@ class Sampler:
         reported = len(self.trace)
         self._solve(problems, label)
         while tasks := promising_starts(self.problem, self.solved.values(), self._tried):
+            if time_is_up():
+                break
             before = {theta: self.solved[theta] for theta in tasks}
             problems = {
                 theta: from_controller(self.problem, kappa) for theta, kappa in tasks.items()
@@ -181,19 +188,28 @@ class Sampler:
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            alone = len(tasks) == 1 < self.workers.count  # then it may spread its own searches
+            alone = len(tasks) == 1  # then it may spread its own searches
             unit = partial(inner_unit, workers=self.workers) if alone else inner_unit
-            for key, (rows, payload) in self.workers.map_unordered(unit, tasks):
+            # of a single θ something is known at any time: what ends a search builds on it
+            of_key = {task[2]: (unit, task, len(tasks) == 1) for task in tasks}
+            for key, (found, whole) in results(self.workers, timed, of_key):
                 theta = missing[key]
+                if found is None:
+                    not_searched("theta")
+                    continue
+                rows, payload = found[1]
+                payloads[key] = payload
+                progress.advance()
+                if not whole:  # it may be better with more time: who resumes searches it again
+                    continue
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key
                     own = sample_key(self.inner_hash, theta)
                     self.store.put_unit([], (own, self.inner_hash, theta, payload))
-                payloads[key] = payload
-                progress.advance()
         for theta, key in keys.items():
             known = payloads[key]
-            assert known is not None
+            if known is None:
+                continue
             try:
                 sample = inner_sample(theta, known)
             except (KeyError, TypeError, ValueError) as error:
@@ -203,8 +219,9 @@ class Sampler:
             if theta not in self.solved or gain > 0.0 or sample.feasible > before.feasible:
                 if theta in self.solved:
                     self.improvements += 1
-                    best = (best_key(self.inner_hash, theta), owners[theta], theta, known)
-                    self.store.put_unit([], best, anew=True)
+                    if not time_is_up():
+                        best = (best_key(self.inner_hash, theta), owners[theta], theta, known)
+                        self.store.put_unit([], best, anew=True)
                 self.solved[theta] = sample
             if not sample.feasible and (
                 self.nearest is None or sample.violation < self.nearest.violation
@@ -228,17 +245,25 @@ class Sampler:
             size = 1
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
         with Progress(len(todo), label, quiet=self.quiet) as progress:
-            tasks = [(self.problem, chunk) for chunk in chunks]
-            for samples, _ in self.workers.map_unordered(design_unit, tasks):
+            parts = {i: (design_unit, (self.problem, chunk)) for i, chunk in enumerate(chunks)}
+            for i, (made, _) in results(self.workers, timed, parts):
+                if made is None:
+                    not_searched("design", len(chunks[i]))
+                    continue
+                samples = made[0]
                 self.store.put(samples, self.hash)
                 known |= {sample.key: sample for sample in samples}
                 progress.advance(len(samples))
         before = len(self.trace)
+        inner, found = self.problem.inner, []
         for x, key in zip(points, keys, strict=True):
-            self._spend(key, 1, x[:-2], self._worth(known[key]))
+            if key in known:
+                self._spend(key, 1, x[:-2], self._worth(known[key]))
+                found.append(quantity_sample(x, known[key], inner))
+            else:
+                found.append(unsearched_quantities(x, inner))
         self.report(before)
-        inner = self.problem.inner
-        return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
+        return found
 
     @cached_property
     def truth(self) -> TrueQuantities:
@@ -292,7 +317,10 @@ class Sampler:
             J[best]
         ):
             bandwidth = self.trace[best].bandwidth / HZ
-            label = "best so far" if self.whole else "best of this part"
+            label = "best of this part"
+            if self.whole:  # of a design that was found before a plant may exceed a bound
+                label = "best so far" if J[best] < self.spent.told else "best on more plants"
+                self.spent.told = min(self.spent.told, float(J[best]))
             remark(f"{label}: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
 
     def _worth(self, sample: Sample) -> float:

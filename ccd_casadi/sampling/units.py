@@ -4,6 +4,7 @@ let it begin."""
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample, sample_of
 from ccd_casadi.sampling.sample_keys import sample_key
 from ccd_casadi.sampling.store import Sample
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.time_budget import time_is_up
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class NeighbourOptions:
 
 
 Theta = tuple[float, ...]
+R = TypeVar("R")
+Task = TypeVar("Task")
 
 
 def from_neighbour(
@@ -147,6 +151,16 @@ def inner_unit(
     """
     problem, problem_key, key, theta = task
     return key, UNITS[type(problem.controller)](problem, problem_key, key, theta, workers)
+
+
+def timed(
+    unit: Callable[[Task], R], task: Task, at_any_time: bool = False
+) -> tuple[R | None, bool]:
+    """A unit of work, None where the time was up before unless it is due `at_any_time`, and whether
+    it is whole: not ended by its time."""
+    if time_is_up() and not at_any_time:
+        return None, False
+    return unit(task), not time_is_up()
 
 
 def mixed_unit(

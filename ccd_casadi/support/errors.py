@@ -12,6 +12,10 @@ class PlantError(UserError):
     """A model returned something that is not a plant; the message has the remedy."""
 
 
+class NoDesign(UserError):
+    """No controller was found again where one had been: a search ends without, or with another."""
+
+
 def described(error: BaseException) -> str:
     """Write the kind and the message of an exception of foreign code, which may have none.
 

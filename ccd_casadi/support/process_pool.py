@@ -13,6 +13,7 @@ from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
 
 from ccd_casadi.support.interrupts import raise_dropped
+from ccd_casadi.support.time_budget import InTime
 from ccd_casadi.support.worker_process import (
     R,
     T,
@@ -91,10 +92,15 @@ class Workers(AbstractContextManager["Workers"]):
         self.count = max(1, count)
         self.patience = patience
         self._workers: list[WorkerProcess] = []
-        self._mapping = False
+        self._mapping, self._ended = False, 0.0
 
     def __exit__(self, *_: object) -> None:
         self._end(self._workers)
+
+    @property
+    def processor_seconds(self) -> float:
+        """What its processes have used up to now."""
+        return self._ended + sum(worker.processor_seconds for worker in self._workers)
 
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
@@ -124,10 +130,11 @@ class Workers(AbstractContextManager["Workers"]):
         self._mapping = True
         waiting, retried = deque(range(done_here, len(tasks))), set[int]()
         running: Running = {}
+        in_time = InTime(function)
         try:
             while waiting or running:
                 raise_dropped()
-                self._feed(function, tasks, waiting, running)
+                self._feed(in_time, tasks, waiting, running)
                 for pipe in connection.wait(list(running)):
                     assert isinstance(pipe, connection.Connection)
                     worker, index = running[pipe]
@@ -148,7 +155,7 @@ class Workers(AbstractContextManager["Workers"]):
                         continue
                     # Only now: an interrupted answer leaves the worker among those to be ended.
                     del running[pipe]
-                    self._feed(function, tasks, waiting, running)
+                    self._feed(in_time, tasks, waiting, running)
                     if not done:
                         raise value
                     yield value
@@ -175,6 +182,7 @@ class Workers(AbstractContextManager["Workers"]):
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():
             for worker in [worker for worker in workers if worker in self._workers]:
+                self._ended += worker.processor_seconds
                 worker.end()
                 self._workers.remove(worker)
 

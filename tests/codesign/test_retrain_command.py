@@ -45,7 +45,7 @@ def test_a_finished_run_is_retrained_in_a_copy(
     assert (out / "surrogate.json").read_bytes() == (out / "surrogates/0001.json").read_bytes()
     assert "<html" in (out / "report.html").read_text()[:200]
 
-    def untouchable(*_: Any) -> None:
+    def untouchable(*_: Any, **more: Any) -> None:
         raise AssertionError("this was sampled already")
 
     for name in ("inner_unit", "design_unit"):

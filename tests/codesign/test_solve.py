@@ -182,7 +182,7 @@ def test_a_second_run_reuses_every_sample(
     folder = Path(shutil.copytree(solved("nested"), tmp_path / "run"))
     before = read(folder)
 
-    def untouchable(*_: Any) -> None:
+    def untouchable(*_: Any, **more: Any) -> None:
         raise AssertionError("this was sampled already")
 
     monkeypatch.setattr(sampling, "inner_unit", untouchable)
@@ -192,6 +192,7 @@ def test_a_second_run_reuses_every_sample(
     assert f"resuming      {folder / 'samples.sqlite'} holds " in capsys.readouterr().err
     after = read(folder)
     assert after.pop("seconds") < before.pop("seconds")
+    assert after.pop("phase_seconds").keys() == before.pop("phase_seconds").keys()
     assert after == before
 
 
@@ -226,6 +227,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
         assert main([str(case), *words, "--workers", workers]) in (0, 4)
     one, two = (read(tmp_path / workers) for workers in ("1", "2"))
     assert one.pop("seconds") > 0.0 < two.pop("seconds")
+    assert one.pop("phase_seconds").keys() == two.pop("phase_seconds").keys()
     assert one == two
     for name in ("controller.json", "surrogate.json", "case.toml"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()

@@ -48,6 +48,7 @@ def test_a_solve_on_a_cluster_is_the_solve_on_one_worker(shared: Processes, tmp_
     assert main([*words, str(folder), "--scheduler", shared.address]) in (0, 4)
     here, there = (json.loads((f / "result.json").read_text()) for f in (one, folder))
     assert here.pop("seconds") > 0.0 < there.pop("seconds")
+    assert here.pop("phase_seconds").keys() == there.pop("phase_seconds").keys()
     assert here == there
     for name in ("controller.json", "surrogate.json", "case.toml"):
         assert (one / name).read_bytes() == (folder / name).read_bytes()

@@ -51,6 +51,7 @@ def wait_for_rows(process: subprocess.Popen[str], path: Path, least: int) -> Non
 def result(folder: Path) -> dict[str, Any]:
     found = json.loads((folder / "result.json").read_text())
     assert found.pop("seconds") > 0.0
+    assert found.pop("phase_seconds")
     return found
 
 

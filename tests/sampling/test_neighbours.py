@@ -26,7 +26,9 @@ SLOPE = 40.0
 def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
     """A unit of work whose climbs lose the better controller at a cliff, but from its own κ."""
 
-    def unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> tuple[list, tuple]:
+    def unit(
+        task: tuple[CoDesignProblem, str, str, tuple[float, ...]], workers: object = None
+    ) -> tuple[list, tuple]:
         case, _, key, theta = task
         sections, z = case.controller, (theta[0] - 55.0) / 15.0
         assert isinstance(sections, StructuredProblem)

@@ -198,7 +198,7 @@ def test_a_design_that_rounding_destroys_is_not_verified(
 def test_lost_workers_leave_a_run_to_be_resumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(*_: Any) -> None:
+    def killed(*_: Any, **more: Any) -> None:
         raise WorkerLost("a worker process died twice on the task x")
 
     monkeypatch.setattr(sampling, "inner_unit", killed)

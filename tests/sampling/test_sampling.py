@@ -47,7 +47,7 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Sa
         yield path, sampler
 
 
-def untouchable(*_: Any) -> Any:
+def untouchable(*_: Any, **more: Any) -> Any:
     raise AssertionError("this was known already")
 
 
@@ -142,7 +142,7 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
 ) -> None:
     shortfalls = {55.0: 0.3, 62.5: 0.1, 70.0: None}  # by m1; None: feasible
 
-    def unit(task: tuple[Any, ...]) -> tuple[str, Any]:
+    def unit(task: tuple[Any, ...], workers: object = None) -> tuple[str, Any]:
         *_, key, theta = task
         violation = shortfalls[theta[0]]
         met = violation is None
@@ -200,7 +200,7 @@ def test_a_trace_tells_bandwidths_where_j_counts_an_error(
 ) -> None:
     """It had the error, in m, for the bandwidth."""
 
-    def unit(task: Any) -> Any:
+    def unit(task: Any, workers: object = None) -> Any:
         _, _, key, _ = task
         payload: dict[str, Any] = {"bandwidth": 300.0, "error": 2e-9, "gradient": [0.0, 0.0]}
         payload |= {"active": [], "shortfall": "", "violation": 0.0, "syntheses": 1, "kappa": [1.0]}

@@ -25,11 +25,18 @@ from ccd_casadi.fixed_structure.local_search import Point, optimality
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, climbed, lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import (
+    LoopOnBox,
+    WorstPlantOptions,
+    climbed,
+    lattice,
+    worst_plants,
+)
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
+from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis.closed_loop import measure
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.
@@ -282,6 +289,18 @@ def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     assert heads[0].value == pytest.approx(
         asked.excesses([(heads[0].option, heads[0].point)])[0]
     )
+
+
+def test_plants_are_assessed_alike_by_any_number_of_workers(design) -> None:
+    box = uncertain(resonance_shift=0.02, gain=0.03)
+    asked = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
+    points = lattice(box, 60, 7)
+    assert len(points) > WorstPlantOptions.batch
+    whole = asked.assessed(box.plants(points)).largest
+    with Workers(2) as workers:
+        spread = asked.excesses(points, workers)
+    assert (spread == asked.excesses(points)).all()
+    np.testing.assert_allclose(spread, whole, atol=1e-6)  # measured: 2e-9
 
 
 def test_far_within_all_bounds_the_worst_plant_is_named_too(design) -> None:

@@ -21,6 +21,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, local_search, synthesise_sections
 from ccd_casadi.fixed_structure import least_value as module
 from ccd_casadi.fixed_structure.least_value import RmsError, least_value
+from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.text import HZ
 
 BUDGET = ErrorBudget((
@@ -102,6 +103,24 @@ def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
                         only_initial=True)  # fmt: skip
     assert len(begun) == 1
     assert (twice.value, twice.steps) == (alone.value, alone.steps)
+
+
+def test_descents_end_alike_on_any_number_of_workers() -> None:
+    plants = [plant(0.01)]
+    problem, kappa = loop(0, PID, FAST)
+    initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
+                                only_initial=True)  # fmt: skip
+    goal = RmsError(tuple(plants), PID, BUDGET, FAST)
+    begins, ends = [initial + 0.05, initial], []
+    for count in (1, 2):
+        with Workers(count) as workers:
+            found = least_value(plants, KEPT, first, goal, sampling=FAST, initial=begins,
+                                workers=workers)  # fmt: skip
+        ends.append(found)
+    assert (ends[0].value, ends[0].steps) == (ends[1].value, ends[1].steps)
+    alone = least_value(plants, KEPT, first, goal, sampling=FAST, initial=begins)
+    assert ends[0].value == pytest.approx(alone.value, rel=1e-6)
 
 
 @pytest.mark.parametrize(
