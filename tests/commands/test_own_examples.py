@@ -39,6 +39,18 @@ def test_three_mass_axis_is_designed_between_its_bounds(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_magnetic_axis_comes_back_on_its_whole_square_law(tmp_path: Path) -> None:
+    """The example's simulation shares nothing with the package."""
+    axis = Path(shutil.copytree(EXAMPLES / "magnetic_axis", tmp_path / "axis"))
+    run = solved(axis / "case.toml", tmp_path / "run")
+    assert run.result["status"] == "verified"
+    assert {"S_max", "too weak"} <= set(run.result["active"])
+    moved = runpy.run_path(str(axis / "simulate.py"))["simulate"](tmp_path / "run")
+    assert np.abs(moved).max() < 2e-5
+    assert np.abs(moved[200:]).max() < 1e-7
+
+
+@pytest.mark.slow
 def test_gantry_is_designed_from_its_table_alone_and_holds_on_the_true_model(
     tmp_path: Path,
 ) -> None:
