@@ -28,6 +28,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "survives": "a [robust] set in the case",
     "deployable": "a higher rate or less delay",
     "unproven": "a smaller [robust] set, or fewer parameters in it",
+    "budget": "solve again with a larger --budget, which goes on from what is stored",
     "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
 }
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
@@ -205,10 +206,14 @@ def advice(result: Mapping[str, Any]) -> str:
             words = "Do not build this yet: what it survives is not known."
             return f"{words} Next: {NEXT['survives']}."
         warned.append(f"the [robust] set is {unproven(result)}")
+    budget = result.get("time_budget", {})
+    if ended := bool(budget.get("ended")):
+        warned.append(f"the search was ended by its budget of {budget['minutes']:g} min")
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
         steps = [NEXT["unproven"]] * unclosed + [NEXT["loop"]] * bool(looked_at)
+        steps += [NEXT["budget"]] * ended
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
         return words + (f" Next: {'; '.join(steps)}." if steps else "") + after
     return (

@@ -105,6 +105,15 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     assert "a surrogate without it misses ω_b by 2.2 %" in conclusion(result)
 
 
+def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
+    ended = result_of(optimal="unknown") | {"time_budget": {"minutes": 5.0, "ended": True}}
+    words = advice(ended)
+    assert words.startswith("Build this only if you accept: the search was ended by its budget of 5")
+    assert "a larger --budget" in words
+    within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
+    assert "budget" not in advice(within)
+
+
 @pytest.mark.parametrize(
     ("states", "said"),
     [
