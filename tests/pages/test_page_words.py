@@ -108,7 +108,9 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
 def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended = result_of(optimal="unknown") | {"time_budget": {"minutes": 5.0, "ended": True}}
     words = advice(ended)
-    assert words.startswith("Build this only if you accept: the search was ended by its budget of 5")
+    assert words.startswith(
+        "Build this only if you accept: the search was ended by its budget of 5"
+    )
     assert "a larger --budget" in words
     within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
     assert "budget" not in advice(within)
