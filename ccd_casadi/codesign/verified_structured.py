@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -31,6 +31,7 @@ from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import (
+    bounds_of,
     structured_of,
     uncertain_plant,
     with_structured,
@@ -114,7 +115,14 @@ class VerifiedStructured(Verified):
 
     @cached_property
     def judgement(self) -> Judgement:
-        return judgement_of(self.wide, self.checked)
+        """Over the case's own bounds, of which the certificate is within `looseness`."""
+        found, bounds = judgement_of(self.wide, self.checked), bounds_of(self.problem)
+        if not self.wide.plants or not all(plant.stable for plant in self.wide.plants):
+            return found
+        plants = self.wide.plants
+        each = [bounds.shares(one) | bounds.channel_shares(one.channels) for one in plants]
+        worst = {name: max(shares[name] for shares in each) for name in each[0]}
+        return replace(found, figures={**found.figures, **worst})
 
     @property
     def set_is_met(self) -> bool:

@@ -162,7 +162,7 @@ def design_parts(
     """The chapters about a design by itself; `own`: the problem with its design plant chosen."""
     move = cache(lambda: move_figure(own, theta, view))
     parts: dict[str, Part] = {
-        "glance": lambda: [glance(own, theta, view, move())],
+        "glance": lambda: [_required_first(result, glance(own, theta, view, move()))],
         "design": lambda: [design_chapter(problem, result)],
         "move": lambda: [c.Chapter("A move", (move(),))],
         "motor": lambda: cycle_chapter(own, theta, result),
@@ -179,12 +179,17 @@ def design_parts(
     return parts
 
 
+def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
+    """A chapter that begins with the requirements, where the result lists them."""
+    table = (requirements_table(result),) if result.get("requirements") else ()
+    return replace(chapter, body=(*table, *chapter.body))
+
+
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     structured = "proof" in result
     binds = (binding_words if structured else binding)(problem, result)
     body = (
-        requirements_table(result),
         theta_table(problem, result),
         c.Facts(tuple(facts("structured" if structured else "design", problem, result))),
         c.Heading("What binds"),
