@@ -72,10 +72,11 @@ def as_lines(
     """The response as the controller sees it; of a model also itself in discrete time."""
     if isinstance(item, MeasuredResponse):
         kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
-        lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
-        G = (item.matrix * lag).reshape(item.G.shape)
         spread = item.spread if item.spread is None else item.spread[kept]
-        return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
+        seen = replace(item, hz=item.hz[kept], G=item.G[kept], spread=spread)
+        seen.require_causal()
+        lag = np.exp(-1j * HZ * seen.hz * delay)[:, None, None]
+        return replace(seen, G=(seen.matrix * lag).reshape(seen.G.shape)), None
     system = item
     own = system.period
     if own and rate_hz is None:
