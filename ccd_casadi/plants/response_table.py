@@ -4,14 +4,16 @@ A column that may change the plant and is not understood is refused. Two reading
 possible (radians under the name of degrees, decibels under that of magnitude) are refused too.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
 
 from ccd_casadi.plants.table_columns import (
+    MEGA,
     UNITS,
     WANTED,
     TableColumn,
@@ -71,26 +73,46 @@ def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> Res
     """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
     suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
-        columns = columns_of_arrays(path, npz_arrays(path))
+        content = npz_arrays(path)
+        if {"a", "b", "c"} <= {name.casefold() for name in content}:
+            words = "holds A, B, C of a model, which is read from .mat"
+            raise UserError(f"{path}: {words}; write it with scipy.io.savemat")
+        columns = columns_of_arrays(path, content)
     elif suffix == ".mat":
-        columns = columns_of_arrays(path, mat_variables(path))
+        content = mat_variables(path)
+        columns = columns_of_arrays(path, lines_in(content) or content)
     else:
         columns, notes = columns_of_csv(path)
     return _understood(path, columns, notes, options)
 
 
-def holds_lines(names: Sequence[str]) -> bool:
-    """Report whether one of these variables is a frequency.
+def lines_in(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The variables of a response in a file, or in its only struct, with what is beside that.
 
     Parameters
     ----------
-    names : sequence of str
-        Of the variables of a file.
+    content : mapping
+        Variables by name.
 
     Returns
     -------
-    bool
+    mapping
+        Empty where no frequency is among them.
     """
+    if _has_frequency(content):
+        return content
+    structs = {name: value for name, value in content.items()
+               if getattr(value, "dtype", np.dtype(float)).names}  # fmt: skip
+    if len(structs) != 1:
+        return {}
+    name, struct = next(iter(structs.items()))
+    if struct.size != 1 or not _has_frequency(struct.dtype.names):
+        return {}
+    beside = {key: value for key, value in content.items() if key != name}
+    return beside | {key: struct.ravel()[0][key] for key in struct.dtype.names}
+
+
+def _has_frequency(names: Iterable[str]) -> bool:
     return any((found := meaning_of(name)) and found[0] == "f" for name in names)
 
 
@@ -167,6 +189,9 @@ def _quantities(
                 f"{first!r} and {column.name!r} are the same quantity")  # fmt: skip
             raise UserError(f"{path}: {words}; keep one")
         seen[quantity] = column.name
+        if MEGA.search(column.name):
+            words = f"is in megametres as it is written; it may be {choices(quantity)}"
+            raise UserError(f"{path}: {column.name!r}: {words}")
         if unit not in UNITS[quantity]:
             words = f"has the unit {unit!r}" if unit else "names no unit"
             raise UserError(f"{path}: {column.name!r}: {words}; it may be {choices(quantity)}")

@@ -172,6 +172,13 @@ def tune(
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
     if not given:
         raise UserError("there is no plant to tune for; give one")
+    if not 1.0 < S_max < np.inf:
+        raise UserError(f"S_max: is {S_max:.6g}; no loop has less than 1, so give more")
+    if not 1.0 <= shape < np.inf:
+        raise UserError(f"shape: is {shape:.6g}; give 1 or more")
+    for key, value in (("rate_hz", rate_hz), ("effort", effort)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise UserError(f"{key}: is {value:.6g}; give a number above 0")
     tell = progress or silent
     own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
            "least_damping": least_damping}  # fmt: skip
