@@ -198,8 +198,8 @@ def winding(
     if not measured.modelled and len(large):
         seen = measured.rise(hz[large[-1]])
         if seen.half_turns > measured.unstable_poles + options.risen:
-            words = f"the angle of G rises by {180.0 * seen.half_turns:.0f} deg more than that of "
-            words += "a stable G of its size"
+            words = f"the angle of G rises by {180.0 * seen.half_turns:.0f} deg "
+            words += "more than that of a stable G of its size"
             apart = f"{seen.coarse_first:.4g} to {seen.coarse_last:.4g} Hz: measure there"
             doubts.append(
                 f"{words}: state its unstable poles (--unstable-poles, unstable_poles)"
