@@ -97,6 +97,8 @@ def rise_of(hz: Array, F: np.ndarray, options: DirectionOptions = DirectionOptio
     -------
     Rise
     """
+    if not F.all():
+        return Rise(0.0, np.nan, np.nan)
     places, turns, angle, least = _followed(hz, F, options)
     found, first, last = _largest_rise(angle - least, options.lasting)
     low, high = (float(at) for at in np.exp(places[[first, last]]))
@@ -211,9 +213,12 @@ def turned_words(
         if len(rising) > 1:
             return f"through {len(rising)} resonances, the first at {rising[0]:.4g} Hz"
         return f"through the resonance at {rising[0]:.4g} Hz"
-    if falling or G.shape[1] != G.shape[2] or len(hz) < options.beside[0]:
+    if falling or G.shape[1] != G.shape[2]:
         return ""
-    places, turns, angle, least = _followed(hz, np.linalg.det(G), options)
+    F = np.linalg.det(G)
+    if not F.all():
+        return ""
+    places, turns, angle, least = _followed(hz, F, options)
     turned = np.interp(places, np.log(hz), np.append(0.0, np.cumsum(_sharp_fall(-turns, options))))
     own, first, last = _largest_rise(angle - least, options.compared)
     allowed = unstable_poles + options.risen if unstable_poles else options.turned

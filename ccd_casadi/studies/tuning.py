@@ -194,7 +194,13 @@ def tune(
             least_damping=least_damping or item.least_damping), late)
         for item, late in known
     ]  # fmt: skip
-    read = [as_lines(item, rate_hz, late) for item, late in known]
+    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
+    read = []
+    for i, ((item, late), name) in enumerate(zip(known, names, strict=True), 1):
+        try:
+            read.append(as_lines(item, rate_hz, late))
+        except UserError as error:
+            raise UserError(f"{name or f'plant {i}'}: {error}" if known[1:] else error) from None
     responses = tuple(one for one, _ in read)
     models = tuple(model for _, model in read)
     if structure is None:
@@ -203,7 +209,6 @@ def tune(
     periods = [model.period for model in models if model is not None]
     period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
     bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
-    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
     name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
     inside, initial = options.inside * (S_max - 1.0) if periods else 0.0, None
     for _ in range(options.rounds):

@@ -68,6 +68,9 @@ def test_channels_and_re_for_im_are_refused_too() -> None:
     G = np.stack([[one.G, 0.2 * other.G], [-0.1 * one.G, other.G]]).transpose(2, 0, 1)
     assert not refusal(MeasuredResponse(one.hz, G))
     assert refusal(MeasuredResponse(one.hz, G.conj()))
+    twice = MeasuredResponse(one.hz, np.stack([[one.G, one.G]] * 2).transpose(2, 0, 1))
+    assert not refusal(twice)  # det G = 0
+    assert twice.rise(one.hz[-1]).half_turns == 0.0
     assert refusal(MeasuredResponse(one.hz, 1j * one.G.conj()))  # re and im exchanged
 
 
