@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy
 
+from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
 from ccd_casadi.lti.loop import Sampling
@@ -25,10 +26,16 @@ class MotionOptions:
         Along the imaginary axis: derivatives of analytic functions, exact to rounding.
     spring : float
         Of the moving force: a plant that holds its output by more has a spring.
+    instants : int
+        Of a continuous move, at which its feedforward is examined.
+    beside : float
+        Of the duration: how far beside a jump of the snap, too.
     """
 
     complex_step: float = 1e-30
     spring: float = 1e-6
+    instants: int = 2000
+    beside: float = 1e-9
 
 
 @dataclass(frozen=True)
@@ -204,6 +211,29 @@ class MotionAt:
     stepped: tuple[Cycle, ...]
     forward: Array
     forward_slopes: Array
+
+    def forward_force(self, sampling: Sampling | None) -> float:
+        """The largest force of the feedforward on any motor, with all its terms.
+
+        Parameters
+        ----------
+        sampling : Sampling or None
+            None: continuous, examined at the ends of the profile's intervals and between.
+
+        Returns
+        -------
+        float
+            N.
+        """
+        profile = self.cycle.profile
+        if sampling is None:
+            ends = np.cumsum(profile.durations.real)
+            beside = ends[:, None] + profile.duration * MotionOptions().beside * np.array([-1, 1])
+            most = np.linspace(0.0, profile.duration, MotionOptions().instants)
+            r = profile.at(np.concatenate([beside.ravel(), most]))
+            return float(np.abs(r.T @ self.forward).max())
+        time = np.arange(np.ceil(profile.duration / sampling.period) + 2) * sampling.period
+        return float(np.abs(forward_force(profile, self.forward, time, sampling.period)[1]).max())
 
     def slopes(self, read: Callable[[Cycle], Any]) -> Array:
         """Derivatives (n,) of a figure of the cycle."""

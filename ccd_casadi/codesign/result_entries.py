@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.structured_bandwidth import exact_times, motion_of
+from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
@@ -111,9 +111,13 @@ def move_entry(
     if problem.source.motion is None:
         return {}
     motion = motion_of(problem, theta)
-    times = exact_times(problem, motion, kind_of(problem).plants(theta), controller)
+    made = exact_moves(problem, motion, kind_of(problem).plants(theta), controller)
     cycle, own = motion.cycle, problem.source.motion
+    times = np.maximum([move.settled for move in made], cycle.profile.duration)
+    ahead = motion.forward_force(problem.sampling)
+    needed = max(float(cycle.peak_force), ahead, *(float(one.peak_force.max()) for one in made))
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
+    k, _, most = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
@@ -126,7 +130,11 @@ def move_entry(
         "limits": list(cycle.limits),
         **{key: float(getattr(cycle, key)) for key in ("peak_force", "rms_force", *of_motor)},
         **({} if own.motor is None else {
-            "peak_current": cycle.peak_force / own.motor.at(motion.mass)[0]}),
+            "peak_current": cycle.peak_force / k,
+            "needed_current": needed / k,
+            "needed_share": needed / (k * most)}),
+        "feedforward_force": ahead,
+        "needed_force": needed,
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip
 

@@ -115,8 +115,8 @@ def design_on_data(
     Raises
     ------
     UserError
-        Responses of unlike shape or sign, derivatives of a displacement, or lines beyond half the
-        sampling rate.
+        Responses of unlike shape or sign, derivatives of a displacement, phases that rise as of no
+        causal plant, or lines beyond half the sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
@@ -132,6 +132,7 @@ def design_on_data(
             raise UserError(
                 f"the measured response is {one.derivative}; G is displacement over force"
             )
+        one.require_causal()
     sign = 1.0
     if shapes == {(1, 1)}:
         sign = _sign(responses)

@@ -23,6 +23,7 @@ from ccd_casadi.kernels.sections import HALF_POWER
 from ccd_casadi.lti.loop import tustin
 from ccd_casadi.lti.state_space import StateSpace, responses_of, sensitivity, sigma_max
 from ccd_casadi.plants.measured import MeasuredResponse
+from ccd_casadi.plants.phase_direction import DirectionOptions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -35,7 +36,7 @@ class WindingOptions:
     gap: float = 0.25 * np.pi  # rad: of G's angle at the first line to its asymptote
     large: float = 2.0  # |L| at the first line at least
     small: float = 0.5  # |L| at the last line at most
-    risen: float = 0.6  # half turns of G's angle beside those of its unstable poles
+    risen: float = DirectionOptions.risen  # half turns beside those of unstable poles
     hidden: float = 0.05  # |GK| beside a resonance between lines, where it may reach 1
 
 
@@ -194,12 +195,17 @@ def winding(
     if len(set(measured.undamped_hz)) < len(measured.undamped_hz):
         doubts.append("G has two undamped modes at one frequency")
     large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > options.small)
-    seen = 0.0 if measured.modelled or not len(large) else measured.excess(hz[large[-1]])
-    if seen > measured.unstable_poles + options.risen:
-        doubts.append(
-            f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of its "
-            "size: state its unstable poles (--unstable-poles, unstable_poles)"
-        )
+    if not measured.modelled and len(large):
+        seen = measured.rise(hz[large[-1]])
+        if seen.half_turns > measured.unstable_poles + options.risen:
+            words = f"the angle of G rises by {180.0 * seen.half_turns:.0f} deg "
+            words += "more than that of a stable G of its size"
+            apart = f"{seen.coarse_first:.4g} to {seen.coarse_last:.4g} Hz: measure there"
+            doubts.append(
+                f"{words}: state its unstable poles (--unstable-poles, unstable_poles)"
+                if np.isnan(seen.coarse_first)
+                else f"{words}, where lines are too far apart from {apart}"
+            )
     if measured.gap > options.gap:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
     if q > 0 and np.linalg.norm(own[0], -2) < options.large:

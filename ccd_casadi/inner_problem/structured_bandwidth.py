@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.analysis.driven_plant import DrivenMechanics
 from ccd_casadi.analysis.motor_cycle import MotionAt
-from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move import Move, simulate
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
@@ -86,10 +86,10 @@ def require_motion(problem: CoDesignProblem) -> None:
     motion_of(problem, problem.start)
 
 
-def exact_times(
+def exact_moves(
     problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
-) -> Array:
-    """Simulate the move on plants: the time until the error stays within the window.
+) -> list[Move]:
+    """Simulate the move on plants.
 
     Parameters
     ----------
@@ -99,19 +99,37 @@ def exact_times(
 
     Returns
     -------
-    array (plants,)
-        s from the start of the move, its end at least.
+    list of Move
+        Of each plant.
     """
     profile = motion.cycle.profile
-    found = [
+    return [
         simulate(
             Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
             bandwidth_hz=MoveCheckOptions.steps / profile.duration,
-        ).settled
+        )
         for plant in plants
     ]  # fmt: skip
-    return np.maximum(found, profile.duration)
+
+
+def exact_times(
+    problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
+) -> Array:
+    """Simulate the move on plants: the time until the error stays within the window.
+
+    Parameters
+    ----------
+    problem, motion, plants, K
+        As of `exact_moves`.
+
+    Returns
+    -------
+    array (plants,)
+        s from the start of the move, its end at least.
+    """
+    made = exact_moves(problem, motion, plants, K)
+    return np.maximum([move.settled for move in made], motion.cycle.profile.duration)
 
 
 def latest_plant(

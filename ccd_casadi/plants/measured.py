@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.plants.response_table import ReadingOptions, least_phase, read_table
+from ccd_casadi.plants.phase_direction import Rise, rise_of, turned_words
+from ccd_casadi.plants.response_table import read_table
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -26,12 +27,6 @@ class MeasuredResponseOptions:
         Decades that a response is extrapolated below its first line.
     per_decade : int
         Lines a decade of that.
-    phase_points : int
-        Points over ln f at which the phase is compared with that of a minimum-phase system.
-    lasting_points : int
-        Points over which an excess of phase must last: both turn sharply at a resonance.
-    unclear_turn : float
-        Angle in rad between two lines beyond which its sign is not known.
     derivative_gap : float
         Largest distance of slope (1) and angle (rad) from those of a time derivative.
     first_lines : float
@@ -42,9 +37,6 @@ class MeasuredResponseOptions:
 
     decades_below: int = 3
     per_decade: int = 25
-    phase_points: int = ReadingOptions.bode_points
-    lasting_points: int = ReadingOptions.bode_points // 10
-    unclear_turn: float = 2.0
     derivative_gap: float = 0.35
     first_lines: float = 1.5
     peak: float = 1.0
@@ -172,22 +164,32 @@ class MeasuredResponse:
         turned = self.matrix[0] * 1j**self.slope
         return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
 
-    def excess(self, to_hz: float) -> float:
-        """Half turns by which the angle of det G rises from the first line on, up to `to_hz`, more
-        than that of a stable G of this size: each unstable pole there adds one."""
+    def rise(self, to_hz: float) -> Rise:
+        """By how much the angle of det G rises up to `to_hz`, more than that of a stable G of this
+        size: each unstable pole there adds half a turn."""
         used = self.hz <= to_hz
-        if used.sum() < 3 or self.matrix.shape[1] != self.matrix.shape[2]:
-            return 0.0
-        x, F = np.log(self.hz[used]), np.linalg.det(self.matrix[used])
-        places = np.linspace(x[0], x[-1], self.options.phase_points)
-        least = least_phase(np.interp(places, x, np.log(np.abs(F))), places)
-        turns = np.angle(F[1:] / F[:-1])
-        unclear = np.abs(turns) > self.options.unclear_turn
-        turns = np.where(unclear, -np.abs(turns), turns)
-        risen = np.interp(places, x, np.append(0.0, np.cumsum(turns))) - least
-        windows = np.lib.stride_tricks.sliding_window_view
-        lasting = windows(risen - risen[0], self.options.lasting_points).min(axis=1)
-        return float(lasting.max() / np.pi)
+        many = max(3, int(np.searchsorted(self.hz, self.options.first_lines * self.hz[0])))
+        if used.sum() < many or self.matrix.shape[1] != self.matrix.shape[2]:
+            return Rise(0.0, np.nan, np.nan)
+        return rise_of(self.hz[used], np.linalg.det(self.matrix[used]))
+
+    def require_causal(self) -> None:
+        """Raise UserError where its phase rises as that of no stable causal plant.
+
+        Raises
+        ------
+        UserError
+            Its conjugate may be meant, or unstable poles are not stated.
+        """
+        if self.modelled:
+            return
+        where = turned_words(self.hz, self.matrix, self.resonances, self.unstable_poles)
+        if where:
+            raise UserError(
+                f"the phase of the measured response rises {where}: is the sign of the phase or of "
+                "im turned (e^-jwt)? turn it; or state unstable poles (--unstable-poles, "
+                "unstable_poles)"
+            )
 
     @cached_property
     def followed(self) -> "MeasuredResponse":

@@ -264,12 +264,25 @@ def model_parts(
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
     _check_shapes(M, D, K, B, C)
     ratio = _damping_ratio(result.get("damping_ratio"))
+    for key, value in constraints.items():
+        if _is_comparison(value):
+            words = "is a comparison; return a number"
+            raise PlantError(f"constraint {key} {words}: h - 1.2 for h < 1.2, met where <= 0")
     given = {"hardware_cost": result["hardware_cost"], **constraints}
     scalars = {key: _converted(kind, key, value) for key, value in given.items()}
     for key, value in scalars.items():
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
     return (M, D, K, B, C), ratio, scalars
+
+
+def _is_comparison(value: Any) -> bool:
+    """Whether it is true or false, as a number or as an expression of CasADi."""
+    if not isinstance(value, ca.SX | ca.MX):
+        return np.asarray(value).dtype.kind == "b"
+    comparing = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR)
+    scalar = value.shape == (1, 1) and not value.is_constant() and not value.is_symbolic()
+    return scalar and value.op() in comparing
 
 
 def _damping_ratio(value: Any) -> float | None:

@@ -4,13 +4,16 @@ A column that may change the plant and is not understood is refused. Two reading
 possible (radians under the name of degrees, decibels under that of magnitude) are refused too.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import scipy
 
 from ccd_casadi.plants.table_columns import (
+    MEGA,
     UNITS,
     WANTED,
     TableColumn,
@@ -43,6 +46,8 @@ class ReadingOptions:
         Mean misfit of the relation in rad beyond which a reading is doubted.
     bode_gain : float
         Share of the misfit below which another reading is as likely.
+    end : float
+        Factor of the first and the last line within which the slope beyond them is read.
     """
 
     few_degrees: float = 30.0
@@ -51,6 +56,7 @@ class ReadingOptions:
     bode_delays: int = 60
     bode_misfit: float = float(np.radians(20.0))
     bode_gain: float = 0.85
+    end: float = 1.5
 
 
 @dataclass(frozen=True)
@@ -67,26 +73,46 @@ def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> Res
     """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
     suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
-        columns = columns_of_arrays(path, npz_arrays(path))
+        content = npz_arrays(path)
+        if {"a", "b", "c"} <= {name.casefold() for name in content}:
+            words = "holds A, B, C of a model, which is read from .mat"
+            raise UserError(f"{path}: {words}; write it with scipy.io.savemat")
+        columns = columns_of_arrays(path, content)
     elif suffix == ".mat":
-        columns = columns_of_arrays(path, mat_variables(path))
+        content = mat_variables(path)
+        columns = columns_of_arrays(path, lines_in(content) or content)
     else:
         columns, notes = columns_of_csv(path)
     return _understood(path, columns, notes, options)
 
 
-def holds_lines(names: Sequence[str]) -> bool:
-    """Report whether one of these variables is a frequency.
+def lines_in(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The variables of a response in a file, or in its only struct, with what is beside that.
 
     Parameters
     ----------
-    names : sequence of str
-        Of the variables of a file.
+    content : mapping
+        Variables by name.
 
     Returns
     -------
-    bool
+    mapping
+        Empty where no frequency is among them.
     """
+    if _has_frequency(content):
+        return content
+    structs = {name: value for name, value in content.items()
+               if getattr(value, "dtype", np.dtype(float)).names}  # fmt: skip
+    if len(structs) != 1:
+        return {}
+    name, struct = next(iter(structs.items()))
+    if struct.size != 1 or not _has_frequency(struct.dtype.names):
+        return {}
+    beside = {key: value for key, value in content.items() if key != name}
+    return beside | {key: struct.ravel()[0][key] for key in struct.dtype.names}
+
+
+def _has_frequency(names: Iterable[str]) -> bool:
     return any((found := meaning_of(name)) and found[0] == "f" for name in names)
 
 
@@ -163,6 +189,9 @@ def _quantities(
                 f"{first!r} and {column.name!r} are the same quantity")  # fmt: skip
             raise UserError(f"{path}: {words}; keep one")
         seen[quantity] = column.name
+        if MEGA.search(column.name):
+            words = f"is in megametres as it is written; it may be {choices(quantity)}"
+            raise UserError(f"{path}: {column.name!r}: {words}")
         if unit not in UNITS[quantity]:
             words = f"has the unit {unit!r}" if unit else "names no unit"
             raise UserError(f"{path}: {column.name!r}: {words}; it may be {choices(quantity)}")
@@ -204,14 +233,33 @@ def _of_size_and_angle(
     return np.asarray(named * np.exp(1j * angle * to_rad))
 
 
-def least_phase(y: Array, x: Array) -> Array:
-    """Phase (rad) of the stable minimum-phase G with ln|G| = y at even x = ln f: Bode's weight of
-    the slope, which is taken to go on beyond the ends."""
-    slope = np.pad(np.gradient(y, x), len(x), mode="edge")
-    v = (np.arange(-len(x), len(x) + 1) + 0.5 / len(x)) * (x[1] - x[0])
-    weight = np.log(1.0 / np.tanh(0.5 * np.abs(v)))
-    smooth = np.convolve(slope, weight / weight.sum(), mode="same")[len(x) : -len(x)]
-    return np.asarray(0.5 * np.pi * smooth)
+def least_phase(y: Array, x: Array, at: Array, *, end: float = ReadingOptions.end) -> Array:
+    """Phase of the stable minimum-phase G of a size, by Bode's integral over its slope.
+
+    Parameters
+    ----------
+    y, x : array (k,)
+        ln|G| at rising ln f, straight between them; beyond the ends it goes on as on average within
+        a factor `end` of them.
+    at : array (n,)
+        ln f where the phase is wanted.
+    end : float
+
+    Returns
+    -------
+    array (n,)
+        rad.
+    """
+    low = max(3, int(np.searchsorted(x, x[0] + np.log(end))))
+    high = min(len(x) - 3, int(np.searchsorted(x, x[-1] - np.log(end))))
+    ends = [np.polyfit(x[part], y[part], 1)[0] for part in (slice(low), slice(high, None))]
+    slope = np.concatenate([ends[:1], np.diff(y) / np.diff(x), ends[1:]])
+    v = x - at[:, None]
+    a = np.exp(-np.abs(v))  # ∫ ln coth|v/2| dv is π²/4 less Legendre's χ₂, twice
+    inside = np.sign(v) * (0.25 * np.pi**2 + scipy.special.spence(1.0 + a)
+                           - scipy.special.spence(1.0 - a))  # fmt: skip
+    most = np.full((len(at), 1), 0.25 * np.pi**2)
+    return np.asarray(np.diff(np.hstack([-most, inside, most]), axis=1) @ slope / np.pi)
 
 
 def _bode_misfit(hz: Array, size: Array, angle: Array, options: ReadingOptions) -> float:
@@ -222,9 +270,7 @@ def _bode_misfit(hz: Array, size: Array, angle: Array, options: ReadingOptions) 
     if len(x) < 5 or not (np.diff(x) > 0.0).all():
         return 0.0
     places = np.linspace(x[0], x[-1], options.bode_points)
-    off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(
-        np.interp(places, x, y), places
-    )
+    off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(y, x, places)
     delays = np.append(0.0, np.geomspace(0.1, 100.0, options.bode_delays))[:, None]
     lag = delays * np.exp(places - places[-1])
     apart = np.abs(np.angle(np.exp(1j * (off + lag)))).mean(axis=1)

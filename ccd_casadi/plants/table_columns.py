@@ -34,6 +34,10 @@ UNITS = {
     "coherence": {"": 1.0},
 }  # fmt: skip
 AS_WRITTEN = {"f": "Hz or rad/s", "angle": "deg or rad", "size": "m/N, mm/N, µm/N, nm/N or dB"}
+MEGA = re.compile(r"(?<![A-Za-z])M[mM]\s*/")  # as a prefix M is mega, never milli
+COMMENT = re.compile(r"\s*[#%]+\s*(\w[\w ]*?)\s*[:=]\s*(.*\S)")  # a name and its value
+CHANGES = frozenset({"gain", "gains", "scale", "scaling", "factor", "delay", "delays", "lag",
+                     "latency", "deadtime", "rate", "period", "dt", "fs", "ts"})  # fmt: skip
 UNIT_NAME = re.compile(r"(?:(.*?)[ _]*units?|units?[ _]+(?:of[ _]+)?(.*))", re.IGNORECASE)
 SI = ("", "m", "n", "m/n", "rad", "n m")  # a unit beside the columns that changes none of them
 WANTED = (
@@ -82,7 +86,7 @@ def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColum
     found = []
     for name, value in content.items():
         numbers = np.asarray(value.toarray() if scipy.sparse.issparse(value) else value)
-        if name.startswith("__") or numbers.dtype.kind in "US" or not numbers.size:
+        if name.startswith("__") or texts_of(value) or not numbers.size:
             continue
         if numbers.dtype.kind not in "biufc":
             raise UserError(f"{path}: {name}: holds no numbers; drop it")
@@ -95,16 +99,77 @@ def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColum
             numbers = numbers.ravel()
         found.append(TableColumn(name, numbers))
     for name, value in sorted(content.items(), key=lambda item: "spread" not in item[0].casefold()):
-        text = np.asarray(value)
-        stated = UNIT_NAME.fullmatch(name) if text.dtype.kind in "US" else None
-        if stated is None or not text.size:
+        stated, units = UNIT_NAME.fullmatch(name), texts_of(value)
+        if stated is None or not units:
             continue
-        if text.size != 1:
-            raise UserError(f"{path}: {name}: holds several texts; give one unit")
-        unit = text.ravel()[0]
-        unit = (unit.decode("latin-1") if isinstance(unit, bytes) else str(unit)).strip()
+        unit = one_text(path, name, units)
         found = _with_stated_unit(path, name, stated[1] or stated[2] or "", unit, found)
     return found
+
+
+def texts_of(value: Any) -> tuple[str, ...]:
+    """The texts of an array or a cell of them; none where it holds anything else."""
+    if scipy.sparse.issparse(value):
+        return ()
+    found = np.asarray(value)
+    if found.dtype.kind == "O":
+        parts = [texts_of(part) for part in found.ravel()]
+        return tuple(text for part in parts for text in part) if all(parts) else ()
+    if found.dtype.kind not in "US":
+        return ()
+    return tuple(text.decode("latin-1") if isinstance(text, bytes) else str(text)
+                 for text in found.ravel())  # fmt: skip
+
+
+def one_text(path: Path, name: str, texts: Iterable[str]) -> str:
+    """What several texts, one a channel, have in common. Raises UserError where they differ."""
+    found = {text.strip() for text in texts}
+    if len(found) != 1:
+        words = f"holds several texts; give one unit for all channels: {', '.join(sorted(found))}"
+        raise UserError(f"{path}: {name}: {words}")
+    return found.pop()
+
+
+def means_a_change(name: str) -> bool:
+    """Whether a name is that of a gain, a delay or a rate.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    bool
+    """
+    words = re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)
+    return "delay" in name.casefold() or any(word.casefold() in CHANGES for word in words)
+
+
+def of_response(name: str) -> bool | None:
+    """Whether a name is that of the unit of a response; None where it is no unit.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    bool or None
+    """
+    stated = UNIT_NAME.fullmatch(name)
+    if stated is None:
+        return None
+    of = stated[1] or stated[2] or ""
+    found = meaning_of(of) if of else ("G", "")
+    return found is not None and found[0] in ("G", "re", "im", "size")
+
+
+def compliance_of(path: Path, name: str, unit: str) -> float:
+    """Factor of a unit of a response to m/N. Raises UserError where it is not understood."""
+    key = "" if unit.casefold() in _PLAIN else unit.casefold()
+    if key not in COMPLIANCE or MEGA.match(unit):
+        raise UserError(f"{path}: {name}: is {unit!r}; it may be {choices('G')}")
+    return COMPLIANCE[key]
 
 
 def _with_stated_unit(
@@ -135,8 +200,12 @@ def _with_stated_unit(
 def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     """The columns of a text table, and what of its form is to be reported."""
     text, notes = _text(path)
-    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1)
-             if line.strip(" \t,;") and not line.lstrip().startswith(("#", "%"))]  # fmt: skip
+    lines, comments = list[tuple[int, str]](), list[tuple[int, str]]()
+    for i, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith(("#", "%")):
+            comments.append((i, line))
+        elif line.strip(" \t,;"):
+            lines.append((i, line))
     if not lines:
         raise UserError(f"{path}: is empty; it needs a header and lines of numbers")
     if lines[0][1].strip() == "-1" or path.suffix.lower() in (".uff", ".unv"):
@@ -180,7 +249,17 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     values = np.array(table)
     parts = [values[:, j] if values[:, j].imag.any() else values[:, j].real
              for j in range(len(names))]  # fmt: skip
-    return [TableColumn(n, part, numbers) for n, part in zip(names, parts, strict=True)], notes
+    columns = [TableColumn(n, part, numbers) for n, part in zip(names, parts, strict=True)]
+    for i, comment in comments:
+        found = COMMENT.fullmatch(comment.rstrip(" \t,;"))
+        stated = UNIT_NAME.fullmatch(found[1]) if found else None
+        if found and stated:
+            of = stated[1] or stated[2] or ""
+            columns = _with_stated_unit(path, f"line {i}, {found[1]}", of, found[2], columns)
+            notes.append(f"line {i} gives the unit {found[2]}")
+        elif found and means_a_change(found[1]):
+            notes.append(f"line {i} is a comment and left out: {found[1]} = {found[2]}")
+    return columns, notes
 
 
 def _text(path: Path) -> tuple[str, list[str]]:

@@ -79,8 +79,8 @@ def cycle_chapter(
     profile, forces, settled = found.cycle.profile, found.forward[2], told["settled_latest"]
     k, R, _ = motor.at(found.mass)
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
-    force = np.outer(profile.at(time)[2], forces)
-    heat = R / k**2 * (force**2).sum(axis=1)
+    force = profile.at(time).T @ found.forward
+    heat = R / k**2 * (np.outer(profile.at(time)[2], forces) ** 2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(told["power"], "mean")
     ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration

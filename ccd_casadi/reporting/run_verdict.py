@@ -29,6 +29,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "deployable": "a higher rate or less delay",
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which goes on from what is stored",
+    "current": "a larger peak_current, or less jerk or acceleration in [move]",
     "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
 }
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
@@ -184,6 +185,7 @@ def advice(result: Mapping[str, Any]) -> str:
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
         lines = all("between two lines" in concern for concern in looked_at)
         after = "more lines there, or more averages" if lines else "a smaller S_max"
+        after = NEXT["current"] if looked_at == current_concern(result) else after
         return f"{words} Next: {after}." if looked_at else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
@@ -212,7 +214,9 @@ def advice(result: Mapping[str, Any]) -> str:
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
-        steps = [NEXT["unproven"]] * unclosed + [NEXT["loop"]] * bool(looked_at)
+        of_motor = current_concern(result)
+        steps = [NEXT["unproven"]] * unclosed + [NEXT["current"]] * len(of_motor)
+        steps += [NEXT["loop"]] * (len(looked_at) > len(of_motor))
         steps += [NEXT["budget"]] * ended
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
         return words + (f" Next: {'; '.join(steps)}." if steps else "") + after
@@ -250,7 +254,31 @@ def loop_concerns(
         where = result.get("sensitivity_peak_between_lines_hz")
         at = "" if where is None else f" about {where:.4g} Hz"
         found.append(f"|S| may reach {reach:.3g} between two lines{at}")
-    return [*found, *result.get("loop_warnings", ())]
+    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
+
+
+def current_concern(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What a move needs beyond the peak current of its motor; empty where it is enough.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConcernOptions
+
+    Returns
+    -------
+    list of str
+    """
+    move = result.get("move") or {}
+    share = move.get("needed_share")
+    if share is None or not share > 1.0 + options.slack:
+        return []
+    most = move["needed_current"] / share
+    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
+    return [f"{words}, and peak_current is {most:.4g} A"]
 
 
 def head_words(result: Mapping[str, Any]) -> str:

@@ -5,17 +5,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 
 from ccd_casadi.lti.frequency_grid import RootOptions, frequency_grid, root_flanks
 from ccd_casadi.lti.loop import delay_parts, delayed, sampled
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
-from ccd_casadi.plants.response_table import holds_lines
+from ccd_casadi.plants.response_table import lines_in
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
+from ccd_casadi.synthesis.matlab_systems import bare
 
 Plant = MeasuredResponse | StateSpace
 
@@ -40,6 +41,8 @@ class LineOptions:
         Least relative distance of two lines.
     at_rest : float
         Share of the largest root below which a root lies at 0.
+    most_samples : int
+        Samples of a delay at most.
     """
 
     per_decade: int = 60
@@ -50,6 +53,7 @@ class LineOptions:
     hidden: float = 1e-12
     apart: float = 1e-6
     at_rest: float = 1e-7
+    most_samples: int = 1000
 
 
 def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
@@ -70,12 +74,14 @@ def as_lines(
     item: Plant, rate_hz: float | None, delay: float, *, options: LineOptions = LineOptions()
 ) -> tuple[MeasuredResponse, StateSpace | None]:
     """The response as the controller sees it; of a model also itself in discrete time."""
+    _require_short(item, rate_hz, delay, options)
     if isinstance(item, MeasuredResponse):
         kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
-        lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
-        G = (item.matrix * lag).reshape(item.G.shape)
         spread = item.spread if item.spread is None else item.spread[kept]
-        return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
+        seen = replace(item, hz=item.hz[kept], G=item.G[kept], spread=spread)
+        seen.require_causal()
+        lag = np.exp(-1j * HZ * seen.hz * delay)[:, None, None]
+        return replace(seen, G=(seen.matrix * lag).reshape(seen.G.shape)), None
     system = item
     own = system.period
     if own and rate_hz is None:
@@ -124,6 +130,19 @@ def as_lines(
     return found, model
 
 
+def _require_short(item: Plant, rate_hz: float | None, delay: float, options: LineOptions) -> None:
+    """Raise UserError where a delay is not one that a loop can have."""
+    if not (np.isfinite(delay) and delay >= 0.0):
+        raise UserError(f"delay: is {delay:.6g}; give it in s, 0 or more")
+    if isinstance(item, MeasuredResponse):
+        rate = rate_hz or 2.0 * float(item.hz[-1])
+    else:
+        rate = rate_hz or 1.0 / (item.period or np.inf)
+    if delay * rate > options.most_samples:
+        words = f"delay {delay:.6g} s is {delay * rate:.6g} samples at {rate:.6g} Hz"
+        raise UserError(f"{words}: is it in microseconds? give it in s")
+
+
 def _folded(rates: np.ndarray, T: float) -> np.ndarray:
     """Rates in 1/s with their frequencies where a sampled system has them, up to half the rate."""
     turns = np.abs(rates.imag) * T
@@ -155,13 +174,11 @@ def _require_seen(system: StateSpace, options: LineOptions) -> None:
 def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
     """A measured response, or the one model of a .mat file."""
     try:
-        variables = scipy.io.whosmat(path) if path.suffix.lower() == ".mat" else []
-    except Exception:  # a damaged file: what reads it says so
-        variables = []
-    names = {name for name, _, _ in variables}
-    if holds_lines(sorted(names)) or not (
-        {"A", "B", "C"} <= names or any(kind == "struct" for _, _, kind in variables)
-    ):
+        content = mat_variables(path) if path.suffix.lower() == ".mat" else {}
+    except UserError:  # what reads it states why
+        content = {}
+    structs = any(getattr(value, "dtype", np.dtype(float)).names for value in content.values())
+    if lines_in(content) or not (bare(content) or structs):
         return read_frequency_response(path)
     systems = interchange.read_mat(path).systems
     if len(systems) != 1:

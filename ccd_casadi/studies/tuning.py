@@ -24,7 +24,6 @@ from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_fla
 from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
-from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.studies.tuned_plants import (
     LineOptions,
     Plant,
@@ -173,30 +172,43 @@ def tune(
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
     if not given:
         raise UserError("there is no plant to tune for; give one")
+    if not 1.0 < S_max < np.inf:
+        raise UserError(f"S_max: is {S_max:.6g}; no loop has less than 1, so give more")
+    if not 1.0 <= shape < np.inf:
+        raise UserError(f"shape: is {shape:.6g}; give 1 or more")
+    for key, value in (("rate_hz", rate_hz), ("effort", effort)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise UserError(f"{key}: is {value:.6g}; give a number above 0")
     tell = progress or silent
     own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
            "least_damping": least_damping}  # fmt: skip
     stated = [name for name, value in own.items() if value is not None]
     known = [read_plant(item, delay, tell) for item in given]
-    read = [as_lines(item, rate_hz, late) for item, late in known]
-    models = tuple(model for _, model in read)
-    if stated and None not in models:
+    if stated and all(isinstance(item, StateSpace) for item, _ in known):
         words = f"{', '.join(stated)}: is of measured plants, and of a model its poles are known"
         raise UserError(f"{words}; drop it")
-    responses = tuple(
-        one if G is not None else replace(
-            one, unstable_poles=unstable_poles or one.unstable_poles,
-            poles_at_zero=one.poles_at_zero if poles_at_zero is None else poles_at_zero,
-            least_damping=least_damping or one.least_damping)
-        for one, G in read
-    )  # fmt: skip
+    known = [
+        (item if isinstance(item, StateSpace) else replace(
+            item, unstable_poles=unstable_poles or item.unstable_poles,
+            poles_at_zero=item.poles_at_zero if poles_at_zero is None else poles_at_zero,
+            least_damping=least_damping or item.least_damping), late)
+        for item, late in known
+    ]  # fmt: skip
+    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
+    read = []
+    for i, ((item, late), name) in enumerate(zip(known, names, strict=True), 1):
+        try:
+            read.append(as_lines(item, rate_hz, late))
+        except UserError as error:
+            raise UserError(f"{name or f'plant {i}'}: {error}" if known[1:] else error) from None
+    responses = tuple(one for one, _ in read)
+    models = tuple(model for _, model in read)
     if structure is None:
         biquads = min(options.most_notches, len(responses[0].resonances))
         structure = Structure(biquads=biquads, least_damping=0.1)
     periods = [model.period for model in models if model is not None]
     period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
     bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
-    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
     name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
     inside, initial = options.inside * (S_max - 1.0) if periods else 0.0, None
     for _ in range(options.rounds):
@@ -227,9 +239,9 @@ def tune(
     if design.usable and K is not None:
         coded = K if period is None else realised(tustin(K, period)).as_coded
         judge = judgement.together([
-            judgement.attempted(_judged, plant, late, one, K, coded, bounds, design.bandwidth,
+            judgement.attempted(_judged, plant, late, K, coded, bounds, design.bandwidth,
                                 structure.integrator)
-            for (plant, late), one in zip(known, responses, strict=True)
+            for plant, late in known
         ])  # fmt: skip
         words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
         design = design if judge.passed else replace(design, usable=False, words=words)
@@ -237,14 +249,13 @@ def tune(
 
 
 def _judged(
-    plant: Plant, delay: float, stated: MeasuredResponse, K: StateSpace, coded: StateSpace,
-    bounds: Bounds, bandwidth: float, integrator: bool,
+    plant: Plant, delay: float, K: StateSpace, coded: StateSpace, bounds: Bounds, bandwidth: float,
+    integrator: bool,
 ) -> Judgement:  # fmt: skip
-    """What runs on a plant as it was read; its poles as they are `stated`."""
+    """What runs on a plant as it was read."""
     if isinstance(plant, StateSpace):
         hold = Sampling(1.0 / coded.period, 1e6 * delay)
         return judgement.judge_loops([plant], K, coded, bounds, hold, bandwidth, integrator)
-    plant = replace(plant, unstable_poles=stated.unstable_poles, poles_at_zero=stated.poles_at_zero)
     return judgement.judge_lines(plant, coded, bounds, delay, bandwidth, integrator)
 
 

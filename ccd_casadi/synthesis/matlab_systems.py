@@ -11,6 +11,14 @@ import scipy
 from scipy.linalg import block_diag
 
 from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.plants.table_columns import SI as UNITS_OF_SI
+from ccd_casadi.plants.table_columns import (
+    compliance_of,
+    means_a_change,
+    of_response,
+    one_text,
+    texts_of,
+)
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -176,25 +184,51 @@ def systems_in(path: Path, content: Mapping[str, Any]) -> Iterator[tuple[str, di
     }
     others = {name: value for name, value in content.items()
               if name not in structs and not name.startswith("__")}  # fmt: skip
-    if {"A", "B", "C"} <= set(content):
-        size = np.shape(others["A"])
+    units = {name: value for name, value in others.items() if _is_unit(name)}
+    if bare(content):
+        size = np.shape(others["A" if "A" in others else "a"])
         drawn = {
             name: value
             for name, value in others.items()
-            if name.casefold() in FIELDS or (_numbers(value) and np.shape(value) in (size, (1, 1)))
+            if name.casefold() in FIELDS
+            or name in units
+            or means_a_change(name)
+            or (_numbers(value) and np.shape(value) in (size, (1, 1)))
         }
         yield "", drawn
     else:
         for name, value in others.items():
-            changes = name.casefold() in FIELDS - {"a", "b", "c", "d"} or "delay" in name.casefold()
-            if changes and name.casefold() not in OF_NAMES and not _nothing(value):
+            known = name.casefold() in OF_NAMES - {"inputunit", "outputunit"} or name in units
+            changes = name.casefold() in FIELDS - {"a", "b", "c", "d"} or means_a_change(name)
+            if changes and not known and not _nothing(value):
                 raise UserError(
                     f"{path}: {name}: belongs to no system; make it a field of its struct"
                 )
     for name, struct in structs.items():
         if struct.size != 1:
             raise UserError(f"{path}: {name}: is an array of structs; save one struct")
-        yield name, {key: struct.ravel()[0][key] for key in struct.dtype.names or ()}
+        fields = {key: struct.ravel()[0][key] for key in struct.dtype.names or ()}
+        yield name, fields if any(map(_is_unit, fields)) else units | fields
+
+
+def bare(content: Mapping[str, Any]) -> bool:
+    """Report whether the variables of a file are those of a system.
+
+    Parameters
+    ----------
+    content : mapping
+        Variables by name.
+
+    Returns
+    -------
+    bool
+    """
+    return {"A", "B", "C"} <= content.keys() or {"a", "b", "c"} <= content.keys()
+
+
+def _is_unit(name: str) -> bool:
+    """Whether it is a unit that is no field of MATLAB's."""
+    return name.casefold() not in FIELDS and of_response(name) is not None
 
 
 FIELDS = {"a", "b", "c", "d", "e", "ts", "timeunit", "internaldelay",
@@ -203,20 +237,44 @@ FIELDS = {"a", "b", "c", "d", "e", "ts", "timeunit", "internaldelay",
 
 def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     """The system of these fields. Raises UserError naming the one that is not understood."""
+    place = f"{path}: {name}" if name else f"{path}"
     fields: dict[str, Any] = {}
     names: dict[str, str] = {}
     for key, value in given.items():
         if key.casefold() in fields:
-            raise UserError(f"{path}: {name}: has {names[key.casefold()]} and {key}; keep one")
+            raise UserError(f"{place}: has {names[key.casefold()]} and {key}; keep one")
         fields[key.casefold()], names[key.casefold()] = value, key
+    scale, many = 1.0, list[str]()
     for key in fields.keys() - FIELDS:
-        if not _nothing(fields[key]):
+        if not _is_unit(key) or _nothing(fields[key]):
+            continue
+        where, texts = f"{name}.{names[key]}".lstrip("."), texts_of(fields[key])
+        if not texts:
+            raise UserError(f"{path}: {where}: is no text; give the unit, as um/N")
+        text = one_text(path, where, texts)
+        if not of_response(key):
+            if text.casefold() not in {*UNITS_OF_SI, "s", "seconds"}:
+                words = f"is {text!r} and is not understood; give the unit of the plant as unit"
+                raise UserError(f"{path}: {where}: {words}")
+            continue
+        own = compliance_of(path, where, text)
+        if many and own != scale:
+            raise UserError(f"{path}: {where}: is {text!r} and another unit is stated; keep one")
+        scale = own
+        many.append(f"in {text}")
+    if scale != 1.0:
+        for key in ("inputunit", "outputunit"):
+            if not _nothing(fields.get(key)):
+                words = f"is there beside {many[-1].removeprefix('in ')}; keep one"
+                raise UserError(f"{path}: {f'{name}.{names[key]}'.lstrip('.')}: {words}")
+    for key in fields.keys() - FIELDS:
+        if not _is_unit(key) and not _nothing(fields[key]):
             where = f"{name}.{names[key]}".lstrip(".")
             words = "may change the plant and is not understood; drop it, or apply it to A, B, C, D"
             raise UserError(f"{path}: {where}: {words}")
     missing = [part for part in PARTS[:3] if part.casefold() not in fields]
     if missing or (name and "d" not in fields):
-        raise UserError(f"{path}: {name}: has no {(missing or ['D'])[0]}")
+        raise UserError(f"{place}: has no {(missing or ['D'])[0]}")
     reader = _Fields(path, name, fields)
     A, B, C = (reader.matrix(part) for part in PARTS[:3])
     D = reader.matrix("D") if "d" in fields else np.zeros((0, 0))
@@ -224,8 +282,9 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     n, p, m = len(A), *D.shape
     if A.shape != (n, n) or B.shape != (n, m) or C.shape != (p, n):
         sizes = ", ".join(str(part.shape) for part in (A, B, C, D))
-        raise UserError(f"{path}: {name}: the sizes of A, B, C, D do not fit: {sizes}")
-    many = [f"{n} state{'s' * (n != 1)}, {m} input{'s' * (m != 1)}, {p} output{'s' * (p != 1)}"]
+        raise UserError(f"{place}: the sizes of A, B, C, D do not fit: {sizes}")
+    size = f"{n} state{'s' * (n != 1)}, {m} input{'s' * (m != 1)}, {p} output{'s' * (p != 1)}"
+    many = [size, *many]
     if np.size(fields.get("e", ())):
         E = reader.matrix("E")
         # from this condition on the equations of E are algebraic
@@ -247,8 +306,9 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     delay = reader.delay((p, m), Ts or unit, bool(Ts))
     if delay:
         many.append(f"a delay of {delay:.6g} s")
-    scale = 1.0 if Ts else unit
-    return MatlabSystem(StateSpace(A / scale, B / scale, C, D, period=Ts), delay, ", ".join(many))
+    step = 1.0 if Ts else unit
+    found = StateSpace(A / step, B / step, scale * C, scale * D, period=Ts)
+    return MatlabSystem(found, delay, ", ".join(many))
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,15 @@ from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
 from ccd_casadi.analysis.driven_plant import with_motion
-from ccd_casadi.analysis.motor_cycle import Motion, MotionOptions, Motor, cycle_of
+from ccd_casadi.analysis.motor_cycle import Motion, MotionAt, MotionOptions, Motor, cycle_of
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.result_entries import move_entry
 from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
@@ -30,6 +32,7 @@ from ccd_casadi.plants.plant import (
     hardware_slopes,
     mechanics,
 )
+from ccd_casadi.reporting.run_verdict import advice, current_concern
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
@@ -260,3 +263,47 @@ def test_a_required_acceleration_binds_any_kind_of_controller(tmp_path: Path) ->
     masses = np.array([57.0, 61.0])
     assert constraint_values(plant, masses)[0] == pytest.approx(118.0 * 2.0 / 240.0 - 1.0, rel=1e-6)
     assert hardware_slopes(plant, masses)[1][0] == pytest.approx([2.0 / 240.0] * 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_force_that_is_printed_is_that_of_all_terms_of_the_feedforward(held: bool) -> None:
+    """Two tied inertias with 0.8 N m of the rigid body, and 1.02 of the snap that jerk makes."""
+    limits = MoveLimits(0.35, 2.0, 40.0, 4000.0, 1e7)
+    forces = np.array([[0.0], [0.0], [0.02], [8e-6], [-2.0622e-8]])
+    cycle = cycle_of(moving(MOTOR, limits), forces[2])
+    at = MotionAt(moving(MOTOR, limits), 0.0, cycle, (), forces, np.zeros((1, 5, 1)))
+    found = at.forward_force(Sampling(25000.0, 0.0) if held else None)
+    t = np.linspace(0.0, cycle.profile.duration, 200001)
+    truth = np.abs(cycle.profile.at(t).T @ forces).max()
+    assert found == pytest.approx(truth, rel=1e-6 if not held else 0.05)
+    assert found > 1.1 * cycle.peak_force
+    rigid = replace(at, forward=forces * np.array([[0], [0], [1], [0], [0]]))
+    assert rigid.forward_force(Sampling(2500.0, 0.0)) == pytest.approx(cycle.peak_force, rel=1e-6)
+
+
+def test_a_run_counts_what_feedforward_and_feedback_need_of_the_current() -> None:
+    """By a simulation of the loop; the decision names what exceeds the motor."""
+    problem = small()
+    motion = motion_of(problem, problem.start)
+    w, mass = 2.0 * np.pi * 25.0, float(motion.forward[2, 0])  # a lead about w
+    one, gain = np.eye(1), mass * w**2 / 3.0 * 9.0
+    K = StateSpace(-3.0 * w * one, one, -gain * 3.0 * w * (8.0 / 9.0) * one, gain * one)
+    entry = move_entry(problem, problem.start, K)["move"]
+    assert motion.motion.motor is not None
+    _, _, most = motion.motion.motor.at(motion.mass)
+    loops = [Loop(one.plant_si(), K, problem.sampling)
+             for one in kind_of(problem).plants(problem.start)]  # fmt: skip
+    runs = [simulate(loop, motion.cycle.profile, axis=0, forces=motion.forward, window=1e-6,
+                     bandwidth_hz=50.0) for loop in loops]  # fmt: skip
+    assert entry["needed_current"] >= entry["peak_current"]
+    assert entry["needed_share"] == pytest.approx(entry["needed_current"] / most)
+    assert np.isfinite(runs[0].settled)
+    needed = max(entry["feedforward_force"], *(run.peak_force.max() for run in runs))
+    assert entry["needed_force"] == pytest.approx(max(needed, entry["peak_force"]), rel=1e-3)
+    short = {"status": "verified", "move": entry | {"needed_share": 1.2, "needed_current": 12.0}}
+    assert current_concern(short) == [
+        "the move needs 12 A with feedforward and feedback, and peak_current is 10 A"
+    ]
+    assert "a larger peak_current" in advice(short)
+    assert not current_concern({"move": entry | {"needed_share": 1.0}})
+    assert not current_concern({"move": {"peak_share": 0.8}})  # of an older run

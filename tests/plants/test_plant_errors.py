@@ -4,10 +4,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import casadi as ca
 import pytest
 
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.plants.plant import PlantError, model_parts
 
 ROOT = Path(__file__).parents[2]
 PLANT = """
@@ -57,6 +59,7 @@ def test_each_fault_is_told_as_what_it_is(tmp_path: Path, line: str, words: str)
     [(', "constraints": [a - 80.0]', "constraints is a list"),
      (', "constraints": None', "constraints is a NoneType"),
      (', "constraints": {"heavy": None}', "heavy is None"),
+     (', "constraints": {"heavy": a < 80.0}', "heavy is a comparison; .* h - 1.2 for h < 1.2"),
      (', **{"damping_ratio": (0.01,)}', "damping_ratio is a tuple; give one number")],
 )  # fmt: skip
 def test_what_is_returned_in_another_form_is_named(tmp_path: Path, more: str, words: str) -> None:
@@ -72,3 +75,17 @@ def test_a_plant_that_ends_the_process_ends_no_run_as_done(tmp_path: Path) -> No
     assert done.returncode == 2
     assert "would end the program" in done.stderr
     assert not (tmp_path / "out/result.json").exists()
+
+
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+@pytest.mark.parametrize(
+    "bound", ["h < 1.2", "h >= 1.2", "1.2 == h", "ca.logic_and(h < 1.2, h > 0.8)"]
+)
+def test_a_comparison_is_no_constraint(kind: type, bound: str) -> None:
+    h = kind.sym("h")
+    parts = {"mass": h, "stiffness": 1e4, "damping_ratio": 0.01, "input": 1.0,
+             "output": 1.0, "hardware_cost": h}  # fmt: skip
+    given = {"ca": ca, "h": h}
+    with pytest.raises(PlantError, match="constraint light is a comparison"):
+        model_parts(parts | {"constraints": {"light": eval(bound, given)}}, kind)
+    model_parts(parts | {"constraints": {"light": h - 1.2, "idle": 0.0}}, kind)

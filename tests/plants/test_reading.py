@@ -10,7 +10,9 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_matrix
 
-from ccd_casadi.plants.measured import read_frequency_response
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
+from ccd_casadi.studies.tuned_plants import read_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import read_mat
 
@@ -313,6 +315,7 @@ def test_units_of_single_columns_are_those_of_a_table_of_text(tmp_path: Path) ->
         ({"OutputUnit": "um"}, "OutputUnit: is 'um' and is not understood; give the unit"),
         ({"unit": ["um/N", "nm/N"]}, "unit: holds several texts; give one unit"),
         ({"unit": "um/N", "G_unit": "nm/N"}, "keep one"),
+        ({"unit": "Mm/N"}, "is in megametres as it is written; it may be m/N, mm/N"),
     ],
 )
 def test_a_unit_that_is_not_clear_is_refused(
@@ -368,3 +371,100 @@ def test_a_model_in_another_unit_is_refused(
         return
     with pytest.raises(UserError, match=re.escape(words)):
         read_mat(tmp_path / "x.mat")
+
+
+def cell(*texts: str) -> np.ndarray:
+    found = np.empty((len(texts), 1), dtype=object)
+    found[:, 0] = texts
+    return found
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.parametrize("lower", [True, False])
+@pytest.mark.parametrize(("unit", "factor"), [("um/N", 1e-6), ("m/N", 1.0), ("-", 1.0),
+                                              (("nm/N", "nm/N"), 1e-9)])  # fmt: skip
+def test_the_unit_of_a_model_is_that_of_its_response(
+    tmp_path: Path, nested: bool, beside: bool, lower: bool, unit: object, factor: float
+) -> None:
+    m = random_model(np.random.default_rng(1))
+    stated = {"units" if nested else "unit": unit if isinstance(unit, str) else cell(*unit)}
+    written = {key.lower(): value for key, value in m.items()} if lower else dict(m)
+    if nested:
+        content: Fields = {"sys": written} | stated if beside else {"sys": written | stated}
+    else:
+        content = written | stated
+    savemat(tmp_path / "x.mat", content | {"note": "um/N", "author": "me"})
+    named, _ = read_plant(tmp_path / "x.mat", 0.0, lambda words: None)
+    assert isinstance(named, StateSpace)
+    np.testing.assert_allclose(named.C, factor * np.asarray(m["C"]), rtol=1e-12)
+    np.testing.assert_allclose(named.A, np.asarray(m["A"]))
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize(
+    ("beside", "words"),
+    [
+        ({"unit": "furlong/N"}, "unit: is 'furlong/N'; it may be m/N"),
+        ({"unit": "Mm/N"}, "unit: is 'Mm/N'; it may be m/N"),
+        ({"unit": cell("um/N", "m/N")}, "unit: holds several texts; give one unit for all"),
+        ({"unit": 1e-6}, "unit: is no text; give the unit"),
+        ({"unit": "um/N", "G_unit": "nm/N"}, "and another unit is stated; keep one"),
+        ({"output_unit": "um"}, "output_unit: is 'um' and is not understood"),
+        ({"time_unit": "ms"}, "time_unit: is 'ms' and is not understood"),
+        ({"OutputUnit": "um"}, "OutputUnit: "),
+        ({"TimeUnit": "minutes", "Ts": 1.0}, ""),
+        ({"gain": "3 V/N"}, "gain: "),
+        ({"gain": np.ones((1, 7))}, "gain: "),
+        ({"sensor_delay": "300 us"}, "sensor_delay: "),
+        ({"loopDelay": 3e-4}, "loopDelay: "),
+        ({"rate_hz": 5e3}, "rate_hz: "),
+    ],
+)
+def test_what_is_beside_a_model_is_used_or_refused(
+    tmp_path: Path, nested: bool, beside: Fields, words: str
+) -> None:
+    m = random_model(np.random.default_rng(2))
+    savemat(tmp_path / "x.mat", ({"sys": m} if nested else m) | beside)
+    if not words and not nested:
+        assert read_mat(tmp_path / "x.mat").systems[""].system.period == 60.0
+        return
+    with pytest.raises(UserError, match=re.escape(words or "belongs to no system")):
+        read_mat(tmp_path / "x.mat")
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_lines_in_a_struct_are_read(tmp_path: Path, beside: bool) -> None:
+    hz, G = lines_of_six()
+    fields: Fields = {"f_hz": hz, "G": G}
+    content: Fields = {"frf": fields, "unit": cell("um/N", "um/N")}
+    savemat(tmp_path / "x.mat", content if beside else {"frf": fields | {"unit": "um/N"}})
+    found, _ = read_plant(tmp_path / "x.mat", 0.0, lambda words: None)
+    assert isinstance(found, MeasuredResponse)
+    np.testing.assert_allclose(found.G, 1e-6 * G, rtol=1e-12)
+
+
+def test_files_of_models_are_named_as_what_they_are(tmp_path: Path) -> None:
+    m = random_model(np.random.default_rng(3))
+    np.savez(tmp_path / "x.npz", **m)
+    with pytest.raises(UserError, match=r"holds A, B, C of a model, which is read from \.mat"):
+        read_plant(tmp_path / "x.npz", 0.0, lambda words: None)
+    savemat(tmp_path / "x.mat", m | {"B": np.asarray(m["B"]).T})
+    with pytest.raises(UserError) as error:
+        read_mat(tmp_path / "x.mat")
+    assert "x.mat: the sizes of A, B, C, D do not fit" in str(error.value)
+
+
+def test_a_unit_in_a_comment_is_used_and_a_gain_announced(tmp_path: Path) -> None:
+    hz, G = lines_of_six()
+    rows = "".join(f"{f!r},{g.real!r},{g.imag!r}\n" for f, g in zip(
+        hz.tolist(), G.tolist(), strict=True))  # fmt: skip
+    head = "# unit: um/N\n% gain = 3\n# by: me\nf_hz,re,im\n"
+    (tmp_path / "x.csv").write_text(head + rows)
+    found = read_frequency_response(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.G, 1e-6 * G, rtol=1e-12)
+    assert "line 1 gives the unit um/N" in found.words
+    assert "line 2 is a comment and left out: gain = 3" in found.words
+    (tmp_path / "x.csv").write_text(head.replace("re,im", "re (m/N),im (m/N)") + rows)
+    with pytest.raises(UserError, match=r"line 1, unit: gives .* keep one"):
+        read_frequency_response(tmp_path / "x.csv")

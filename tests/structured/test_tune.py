@@ -175,6 +175,16 @@ def test_the_bound_of_effort_has_its_slope() -> None:
         (control.sample_system(LAGS, 0.1), {"delay": 0.05},
          "the delay is 0.05 s, 0.5 periods of 0.1 s, and the plant is sampled; give whole periods"),
         ("none.csv", {}, "cannot be read"),
+        (LAGS, {"rate_hz": 2e3, "delay": 300.0},
+         "delay 300 s is 600000 samples at 2000 Hz: is it in microseconds"),
+        (LAGS, {"rate_hz": 2e3, "delay": -0.1}, "delay: is -0.1; give it in s, 0 or more"),
+        (LAGS, {"rate_hz": 2e3, "delay": np.nan}, "delay: is nan"),
+        (MeasuredResponse(np.arange(1.0, 9.0), 1.0 / (1.0 + 1j * np.arange(1.0, 9.0))),
+         {"delay": 300.0}, "delay 300 s is 4800 samples at 16 Hz"),
+        (LAGS, {"rate_hz": 10.0, "S_max": 1.0}, "S_max: is 1; no loop has less than 1"),
+        (LAGS, {"rate_hz": 10.0, "S_max": np.nan}, "S_max: is nan"),
+        (LAGS, {"rate_hz": 10.0, "shape": 0.9}, "shape: is 0.9; give 1 or more"),
+        (LAGS, {"rate_hz": -10.0}, "rate_hz: is -10; give a number above 0"),
     ],
 )  # fmt: skip
 def test_what_is_no_plant_is_said(plant: object, how: dict, words: str) -> None:
