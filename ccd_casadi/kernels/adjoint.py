@@ -32,10 +32,14 @@ class MixedPullback:
 
     def to_plant_and_weights(self, of):
         """Gradients to A, B, C and the weights, k in front of each."""
-        n, p, m, f = self.n, self.p, self.m, self.f
-        C_ = f[2, 3] * of.C1[:, p + m :, :n] + f[2, 1] * of.A[:, n + p + m :, :n] + self._of_e(of)
+        n = self.n
         w_ = self._to_weights(of.A, of.A_rate, of.C1, of.C1_rate)
-        return of.A[:, :n, :n], of.B2[:, :n], C_, w_
+        return of.A[:, :n, :n], of.B2[:, :n], self._of_y(of) + self._of_e(of), w_
+
+    def _of_y(self, of):
+        """The gradient to C through W3 y."""
+        n, first, f = self.n, self.p + self.m, self.f
+        return f[2, 3] * of.C1[:, first:, :n] + f[2, 1] * of.A[:, n + first :, :n]
 
     def _of_e(self, of):
         """The gradient to C through e = r - y."""
@@ -84,6 +88,39 @@ class MixedPullback:
         w_[:, 3] = (through_pole + through_direct) / self.w[3]
         w_[:, 4] = through_pole / self.w[4]
         return w_
+
+
+class UnstablePullback(MixedPullback):
+    """From `unstable_plant` back to A, B, C and the weight vector (8,).
+
+    To the weights the plant is that of the states [x; ξ]. dY is that of `FourBlockPullback`, and
+    dV = (I - VVᵀ) dY V (VᵀYV)⁻¹, as V stays a basis of the range of Y and turns in no other way.
+    """
+
+    def __init__(self, A, B, C, w, modes):
+        super().__init__(A, B, C, w)
+        self.V, self.Y = modes
+        self.own, self.n = self.n, self.n + self.V.shape[1]
+        self.filter = A - self.Y @ C.T @ C
+
+    def to_plant_and_weights(self, of):
+        """Gradients to A, B, C and the weights, k in front of each."""
+        n, C, V, Y = self.own, self.C, self.V, self.Y
+        copy = slice(n, self.n)
+        of_y, of_e, into = self._of_y(of), self._of_e(of), V.T @ Y @ C.T
+        B1_, to_copy, CV_ = of.B1[:, :n], of.A[:, copy, :n], of_y[:, :, copy]
+        inner_, into_ = of.A[:, copy, copy], of.B1[:, copy] - to_copy @ C.T
+        filter_ = V @ inner_ @ V.T
+        V_ = self.filter.T @ V @ inner_ + C.T @ CV_
+        V_ = (V_ - V @ (V.T @ V_)) @ np.linalg.inv(V.T @ Y @ V)
+        Y_ = (V @ into_ - B1_ - filter_ @ C.T) @ C + V_ @ V.T
+        Y_ = 0.5 * (Y_ + Y_.swapaxes(1, 2))
+        L = np.array([solve_continuous_lyapunov(self.filter.T, -part) for part in Y_])
+        C_ = (of_y + of_e)[:, :, :n] - into.T @ to_copy + CV_ @ V.T
+        C_ += (V @ into_ - B1_ - filter_ @ C.T).swapaxes(1, 2) @ Y
+        C_ -= C @ Y @ (filter_ + 2.0 * L @ Y)
+        w_ = self._to_weights(of.A, of.A_rate, of.C1, of.C1_rate)
+        return of.A[:, :n, :n] + filter_ + 2.0 * L @ Y, of.B2[:, :n], C_, w_
 
 
 class FourBlockPullback(MixedPullback):
@@ -249,6 +286,8 @@ def bound_peak(A, B, C, w, delta, start, least=True):
 def slope_root(slope, start):
     """The root of a maximum's slope next to `start`, `start` itself where there is none near."""
     a, fa = start, slope(start)
+    if fa == 0.0:  # at rest
+        return start
     step = 1e-7 if fa > 0.0 else -1e-7
     for _ in range(12):
         b = start * (1.0 + step)

@@ -193,9 +193,10 @@ def design(
     first = None
     for balanced in (False, True):
         try:
+            made = None
             if channels and not (balanced or delta):
                 made = _synthesise_channels(A, B, C, w, channels, backoff, guess)
-            else:
+            if made is None:
                 made = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta)
             row, Ak, Bk, Ck = made
             row[_BALANCED] = balanced
@@ -230,8 +231,13 @@ def failed_row():
 
 
 def _synthesise_channels(A, B, C, w, channels, backoff, guess):
-    """As `synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together."""
+    """As `synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together.
+
+    None where a block is not stable: its observer then corrects the plant's states.
+    """
     found = [synthesise(c.A, c.B, c.C, w, c.grid, c.gain, backoff, guess, False) for c in channels]
+    if any(item[2][: len(c.A)].any() for item, c in zip(found, channels, strict=True)):
+        return None
     rows = np.array([item[0] for item in found])
     failed = np.flatnonzero(rows[:, Column.CODE])
     if failed.size:

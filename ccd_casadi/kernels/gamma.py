@@ -5,6 +5,8 @@ steps in 1/t than in t. Near the root the third-order expansion of the stable su
 place: a step of order four from one Schur form, whose own terms tell when it is good enough.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
@@ -13,6 +15,20 @@ from ccd_casadi.kernels.generalized_plant import frobenius, squared_weights
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular
 from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 
+
+class LowerBoundOptions(NamedTuple):
+    """Numbers of the bound that no controller passes.
+
+    Attributes
+    ----------
+    rest : float
+        Share of the lowest frequency of a grid that stands for rest, where a plant may have a pole.
+    """
+
+    rest: float = 1e-9
+
+
+OPTIONS = LowerBoundOptions()
 BACKWARD = 8.0 * 2.0**-52  # |δH|/|H| of a Schur form; 6 eps was measured, N up to 35
 
 
@@ -59,7 +75,8 @@ def _least_gain(g):
 def gamma_lower_bound(G, w, grid, sigma):
     """γ_jω = max over ω, from σ_p(G) on a grid and successive parabolas at its best peaks.
 
-    G is the prepared plant. Returns γ_jω and where it is.
+    G is the prepared plant. Rest counts where the lowest frequency has the highest value. Returns
+    γ_jω and where it is.
     """
     n = grid.size
     values = np.empty(n)
@@ -84,6 +101,11 @@ def gamma_lower_bound(G, w, grid, sigma):
                 a, fa, x, fx, b, fb = narrow(a, fa, x, fx, b, fb, new, f)
             if fx > best:
                 best, at = fx, np.exp(x)
+    if at == grid[0]:
+        ω = OPTIONS.rest * grid[0]
+        f = lower_bound_squared(w, _least_gain(response(G, ω)), ω)
+        if f > best:
+            best, at = f, ω
     return np.sqrt(best), at
 
 

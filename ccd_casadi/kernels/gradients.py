@@ -15,8 +15,8 @@ force. dK goes back through the Riccati equation of P_d: with X̄ the gradient t
 Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F gives the gradient to every
 matrix at once, however many parameters there are. γ_opt, where X is infinite, has the same equation
 in the basis [U1; U2] of the stable subspace: only f = λ_min(X⁻¹) and its null vector q appear, T11
-Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0 the filter's solution stands in B1 and has an adjoint Lyapunov
-equation of its own (`pullback`).
+Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0, and for an unstable plant, the filter's solution stands in B1 and
+has an adjoint Lyapunov equation of its own (`adjoint`).
 
 Plain NumPy: a point is differentiated once, and compiled this took a third of the set-up.
 """
@@ -31,6 +31,7 @@ from ccd_casadi.kernels.adjoint import (
     FourBlockPullback,
     MixedPullback,
     PlantGradients,
+    UnstablePullback,
     bound_gradient,
     bound_peak,
 )
@@ -50,6 +51,7 @@ from ccd_casadi.kernels.riccati_synthesis import (
     innovations_plant,
 )
 from ccd_casadi.kernels.sensitivity import Code, Column
+from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant
 from ccd_casadi.support.arrays import Array
 
 
@@ -346,6 +348,8 @@ def _posed(made_for):
     if delta:
         Y, _ = filter_solution(A, B, C, delta)
         gp, back = innovations_plant(A, B, C, w, Y), FourBlockPullback(A, B, C, w, Y, delta)
+    elif modes := unstable_modes(A, C):
+        gp, back = unstable_plant(A, B, C, w, modes), UnstablePullback(A, B, C, w, modes)
     else:
         gp, back = generalized_plant(A, B, C, w), MixedPullback(A, B, C, w)
     return gp, lqr_hamiltonian(gp), back

@@ -27,6 +27,7 @@ from ccd_casadi.kernels.riccati import (
     rounding_noise,
 )
 from ccd_casadi.kernels.sensitivity import Code, Column
+from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant, without_copies
 
 
 class RiccatiSynthesisOptions(NamedTuple):
@@ -194,9 +195,12 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 
 @compiled
 def _mixed(A, B, C, w, grid, sigma):
-    """What the generalized plant of mixed sensitivity has, and γ_jω."""
-    bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
-    return plant_matrices(A, B, C, w), bound
+    """What the generalized plant of mixed sensitivity has, γ_jω, and the largest Re of a pole."""
+    G = prepare(A, B, C)
+    bound, rate = gamma_lower_bound(G, w, grid, sigma)[0], -np.inf
+    for i in range(G[0].shape[0]):
+        rate = max(rate, G[0][i, i])
+    return plant_matrices(A, B, C, w), bound, rate
 
 
 # What follows is plain NumPy around these.
@@ -221,9 +225,11 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
         Its code is CERTIFIED where the controller may go on to be certified.
     A_K, B_K, C_K : arrays
     """
+    modes = None
     if delta == 0.0:
-        matrices, bound = _mixed(A, B, C, w, grid, sigma)
-        gp = MixedPlant(*matrices)
+        matrices, bound, rate = _mixed(A, B, C, w, grid, sigma)
+        modes = unstable_modes(A, C) if rate > 0.0 else None
+        gp = unstable_plant(A, B, C, w, modes) if modes else MixedPlant(*matrices)
     else:
         Y, ok = filter_solution(A, B, C, delta)
         if not ok:
@@ -231,6 +237,14 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
             row[Column.CODE], row[Column.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
             return row, none, none, none
         gp, bound = innovations_plant(A, B, C, w, Y), disturbance_bound(A, B, C, w, delta, grid)[0]
+    row, *K = _solved(gp, bound, backoff, guess, balanced)
+    if modes and row[Column.CODE] == Code.CERTIFIED:
+        K = without_copies(*K, modes)
+    return row, *K
+
+
+def _solved(gp, bound, backoff, guess, balanced):
+    """`synthesise` on a generalized plant."""
     if balanced:
         gp, H0, τ = _balanced(gp, bound)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result

@@ -4,8 +4,8 @@ A back end answers for the standard plant of H∞ control,
 
     ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 
-`riccati` is the package's own and serves stable plants in mixed sensitivity; `slicot` (SB10AD)
-serves any standard plant. `tests/oracles/lmi.py` is a third one.
+`riccati` is the package's own and serves plants without poles on the axis in mixed sensitivity;
+`slicot` (SB10AD) serves any standard plant. `tests/oracles/lmi.py` is a third one.
 
 SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988). It accepts a γ
 when its Riccati solver reports no error and the loop is stable; it tests neither X >= 0 nor the

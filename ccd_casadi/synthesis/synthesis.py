@@ -8,6 +8,7 @@ import numpy as np
 from ccd_casadi.kernels.certified_design import design, judge
 from ccd_casadi.kernels.certified_design import sweep as _sweep
 from ccd_casadi.kernels.sensitivity import Code, Column
+from ccd_casadi.kernels.unstable_plant import unstable_part
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -28,6 +29,22 @@ class CertificateOptions:
     """
 
     unbounded: float = 1e9
+
+
+@dataclass(frozen=True)
+class PoleOptions:
+    """Numbers that decide which poles no mixed sensitivity serves.
+
+    Attributes
+    ----------
+    on_axis : float
+        Re p/|p| up to which a pole that is not stable is on the imaginary axis.
+    hidden : float
+        Share of the inputs' or outputs' size up to which an unstable mode is not driven, or seen.
+    """
+
+    on_axis: float = 1e-9
+    hidden: float = 1e-13
 
 
 class Outcome(StrEnum):
@@ -52,9 +69,13 @@ class Outcome(StrEnum):
         "in the case raise inner.gamma_backoff (1.05, 1.2), lower weights.M_K, or narrow "
         "inner.omega_S_hz and inner.omega_T_hz"
     )
-    PLANT_NOT_STABLE = (
-        "the plant is not stable, as mixed sensitivity needs it: give the weights a disturbance, "
-        "or use ccd.tune"
+    POLE_ON_AXIS = (
+        "the plant has a pole on the imaginary axis, which mixed sensitivity excludes: give the "
+        "weights a disturbance, or use ccd.tune"
+    )
+    NOT_STABILISABLE = (
+        "the plant has an unstable pole that no force drives or no sensor sees: no controller "
+        "stabilises it"
     )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
@@ -194,12 +215,31 @@ def synthesise(
                      omega_low / w0, guess, on.channels, weights.delta,
                      judged_on(plant))  # fmt: skip
     figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
-    if not weights.delta and not np.linalg.eigvals(on.A).real.max(initial=-1.0) < 0.0:
-        figures = replace(figures, outcome=Outcome.PLANT_NOT_STABLE, gamma_opt=np.nan)
+    refused = _refused(on)
+    if refused is Outcome.NOT_STABILISABLE and not figures.certificate.passed:
+        figures = replace(figures, outcome=refused, gamma_opt=np.nan)
+    if refused is Outcome.POLE_ON_AXIS and not weights.delta:
+        figures = replace(figures, outcome=refused, gamma_opt=np.nan)
     controller = plant.controller_si(Ak, Bk, Ck)
     if compliance and figures.certified:
         figures = replace(figures, compliance=compliance_over_family(plant, controller).gain)
     return Design(figures, weights, controller)
+
+
+def _refused(plant: ScaledPlant, options: PoleOptions = PoleOptions()) -> Outcome | None:
+    """Why mixed sensitivity does not serve a plant, by its poles."""
+    poles = np.linalg.eigvals(plant.A)
+    growing = poles[poles.real >= 0.0]
+    if not len(growing):
+        return None
+    if (growing.real <= options.on_axis * np.abs(growing)).any():
+        return Outcome.POLE_ON_AXIS
+    for A, C in ((plant.A, plant.C), (plant.A.T, plant.B.T)):
+        # P is c²/(2 Re p) for one mode, which the outputs see at c
+        seen = 2.0 * np.abs(growing).max() * np.linalg.eigvalsh(unstable_part(A, C)[1])
+        if (seen <= (options.hidden * np.linalg.norm(C)) ** 2).any():
+            return Outcome.NOT_STABILISABLE
+    return None
 
 
 def sweep(
