@@ -75,12 +75,14 @@ class Requirement:
         return {**vars(self), "evidence": self.evidence.value}
 
 
-def requirements(verified: Verified) -> tuple[Requirement, ...]:
+def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
     """List the requirements on a design: bounds on the loop, then constraints on θ.
 
     Parameters
     ----------
     verified : Verified
+    peak_hz : float
+        Where |S| is largest, of one plant.
 
     Returns
     -------
@@ -91,7 +93,7 @@ def requirements(verified: Verified) -> tuple[Requirement, ...]:
         kind_of(verified.problem).bounds(),
         verified.judgement,
     )
-    required, worst = _required(bounds), _worst(verified, bounds)
+    required, worst = _required(bounds), _worst(verified, bounds, peak_hz)
     proven = _proven(verified)
     evidence = Evidence.SEARCHED if judged.plants > 1 else Evidence.JUDGED
     found = []
@@ -141,12 +143,11 @@ def _proven(verified: Verified) -> set[str]:
     }
 
 
-def _worst(verified: Verified, bounds: Bounds) -> dict[str, tuple[str, float]]:
+def _worst(verified: Verified, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
     """On which plant that the design was made on each figure is largest, and at which frequency."""
     low = bounds.omega_low / HZ
     if not isinstance(verified, VerifiedStructured):
-        peak = verified.design.figures.sensitivity_peak_frequency / HZ
-        return {"S_max": ("", peak), "S_low": ("", low)}
+        return {"S_max": ("", peak_hz), "S_low": ("", low)}
     judged, own = verified.design.certificate, structured_of(verified.problem)
     if judged is None or not all(plant.stable for plant in judged.plants):
         return {}

@@ -88,8 +88,9 @@ def result_dict(
     failed = failed or [name for name, line in verdict.items() if line.state is State.FAILED]
     why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
+    figures = verified.figures()
     result = {
-        **verified.figures(),
+        **figures,
         "status": "not_verified" if failed else "verified",
         "reason": words,
         "verdict": {name: line.entry for name, line in verdict.items()},
@@ -109,7 +110,10 @@ def result_dict(
         "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
         "globality": outcome.outer or OuterSolution((), 0),
         "judge": verified.judgement.entry,
-        "requirements": [one.entry for one in requirements(verified)],
+        "requirements": [
+            one.entry
+            for one in requirements(verified, figures.get("sensitivity_peak_hz", math.nan))
+        ],
         "second_engine": verified.second.entry,
         "box_look": {} if look is None else look.entry,
         "notes": list(plant_of(problem).notes(verified.theta)),
