@@ -348,5 +348,5 @@ def _assessed(
     )  # fmt: skip
     if most is None or not found.stable:
         return found
-    gains = {at: sampled_compliance(plants[at], loop) for at, loop in loops.items()}
+    gains = {at: sampled_compliance(plants[at], G, K) for at, G in held.items()}
     return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))

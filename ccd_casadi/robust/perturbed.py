@@ -26,7 +26,7 @@ from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop, in_w
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, sigma_max
+from ccd_casadi.lti.state_space import StateSpace, closed_loop, sensitivity, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
@@ -98,17 +98,20 @@ def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
 
 
 def sampled_compliance(
-    plant: StateSpace, S: StateSpace, *, decades: int = 6, per_decade: int = 60
+    plant: StateSpace, held: StateSpace, K: StateSpace, *, decades: int = 6, per_decade: int = 60
 ) -> float:
     """Find the compliance of a sampled loop, max over ω <= π/T of σ_max(S(e^{jωT}) G(jω)).
 
     A sinusoidal force f beside the held one acts continuously: the outputs at the instants are
-    S G f. The aliased effect of faster forces is not included.
+    S G f. The aliased effect of faster forces is not included. S is (1 + L)⁻¹ of the responses:
+    beside free bodies G is large and S small, and 1 - T would lose its digits.
 
     Parameters
     ----------
-    plant, S : StateSpace
-        G in SI without hold and delay; S in discrete time, stable.
+    plant : StateSpace
+        G in SI without hold and delay.
+    held, K : StateSpace
+        The plant with both, and the controller, in discrete time; their loop is stable.
     decades, per_decade : int
         Of the grid below π/T, and its points in each.
 
@@ -117,10 +120,15 @@ def sampled_compliance(
     float
         m/N.
     """
-    end = np.pi / S.period
+    end, S = np.pi / held.period, closed_loop(held, K).S
     near = root_flanks(np.concatenate([S.rates, plant.poles]))
     grid = frequency_grid(end * 10.0**-decades, end, decades * per_decade, near)
-    return highest(lambda at: sigma_max(S.response(at) @ plant.response(at))[None], grid)[0][0]
+
+    def gain(at: Array) -> Array:
+        errors = sensitivity(held.response(at) @ K.response(at))
+        return sigma_max(errors @ plant.response(at))[None]
+
+    return highest(gain, grid)[0][0]
 
 
 def _bandwidth(S: StateSpace) -> float:

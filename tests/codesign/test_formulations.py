@@ -1,6 +1,7 @@
 """The formulation where the user names none is one that ends; the others say that they do not."""
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -21,6 +22,7 @@ from ccd_casadi.codesign.formulations import (
     usual_name,
 )
 from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -45,6 +47,16 @@ def chain(theta, masses):
         "hardware_cost": sum(m) + 0.1 * sum(k),
     }
 """
+
+
+def stands_in(asked: list) -> Callable[..., Solution]:
+    """In the place of a run: it notes the formulation."""
+
+    def co_design(_: object, formulation: object, __: object) -> Solution:
+        asked.append(formulation)
+        return Solution({}, None, None)  # type: ignore[arg-type]
+
+    return co_design
 
 
 def chain_of(masses: int, folder: Path) -> CoDesignProblem:
@@ -95,7 +107,7 @@ def test_a_script_gets_one_that_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, masses: int, expected: type
 ) -> None:
     asked = []
-    monkeypatch.setattr(run, "co_design", lambda _, formulation, __: asked.append(formulation))
+    monkeypatch.setattr(run, "co_design", stands_in(asked))
     run.solve(chain_of(masses, tmp_path))
     assert [type(item) for item in asked] == [expected]
 
@@ -103,7 +115,7 @@ def test_a_script_gets_one_that_ends(
 def test_a_script_gets_the_formulation_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the options of the case, and those of a case without such tables for a problem."""
     asked = []
-    monkeypatch.setattr(run, "co_design", lambda _, formulation, __: asked.append(formulation))
+    monkeypatch.setattr(run, "co_design", stands_in(asked))
     own = replace(CASE, sampling=replace(CASE.sampling, points=4))
     for given in (own, problem_of(own)):
         run.solve(given)
@@ -135,7 +147,7 @@ def test_the_command_says_what_is_slow(
     monkeypatch.setattr(command, "show_findings", lambda *_: None)
     monkeypatch.setattr("ccd_casadi.cases.case_problem.problem_of", lambda _: chain)
     options = SimpleNamespace(
-        resume=False,
+        resume=False, budget=None,
         case=ROOT / "runs" / "two_mass.toml", out=tmp_path / "run", quiet=False, no_report=True,
         surrogate=None, scheduler=None, workers=1, seed=0,
         formulation=more[1] if more else None,

@@ -81,9 +81,7 @@ def test_a_bound_on_the_compliance_is_kept_or_told(
 ) -> None:
     run, found = deployed
     assert found.compliance is None, "this case bounds none"
-    most = sampled_compliance(
-        run.plant.plant_si(), closed_loop(found.plant, found.realisation.system).S
-    )
+    most = sampled_compliance(run.plant.plant_si(), found.plant, found.realisation.system)
     whole = compliance_of(run.plant, found.reduced).gain
     assert most == pytest.approx(whole, rel=0.05), "the rate is far above the loop's peak"
     at = replace(found, compliance=(Perturbation(0.02), most), compliance_max=1.01 * most)
