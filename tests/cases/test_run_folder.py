@@ -59,7 +59,11 @@ def test_the_design_is_measured_again_as_it_was_written(two_mass_run: Path) -> N
 def test_what_was_changed_is_named(
     two_mass_run: Path, tmp_path: Path, name: str, change: Callable[..., object], words: str
 ) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     edited(folder, name, change)
     with pytest.raises(UserError, match=words) as caught:
         read_run(folder)
@@ -72,7 +76,11 @@ def test_what_was_changed_is_named(
 def test_a_damaged_file_is_named(
     two_mass_run: Path, tmp_path: Path, name: str, text: bytes
 ) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     (folder / name).write_bytes(text)
     with pytest.raises(UserError, match="solve the case"):
         read_run(folder)

@@ -214,7 +214,11 @@ def test_a_constant_cost_leaves_nothing_to_trade(
 
 
 def test_command_writes_numbers_and_a_page(two_mass_run: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     assert main([str(folder), "--points", "3", "--workers", "1", "--quiet"]) == 0
     found = json.loads((folder / "insight.json").read_text())
     assert [point["status"] for point in found["front"]["points"]] == ["verified"]

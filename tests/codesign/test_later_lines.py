@@ -19,7 +19,11 @@ from ccd_casadi.robustness import main as robustness
 
 @pytest.fixture
 def copied(two_mass_run: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    return Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
 
 
 def verdict_of(folder: Path) -> dict:

@@ -49,7 +49,11 @@ def trap(tmp_path: Path) -> Path:
 @pytest.fixture
 def trapped_run(two_mass_run: Path, trap: Path) -> Path:
     """A finished run whose case file was exchanged for the trap."""
-    folder = Path(shutil.copytree(two_mass_run, trap.parent / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, trap.parent / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     for name in ("report.json", "report.html"):  # with them `report` needs no plant
         (folder / name).unlink()
     shutil.copy(trap, folder / "case.toml")
@@ -143,7 +147,11 @@ def test_checking_a_case_executes_nothing(trap: Path) -> None:
 
 
 def test_truth_json_names_installed_packages_only(two_mass_run: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     for name in ("trap", "os:system", "trap.py:f", "../trap", str(tmp_path / "trap.py"), ""):
         (folder / "truth.json").write_text(json.dumps({"truth": name, "formulation": "lifted"}))
         with pytest.raises(UserError, match="is known"):

@@ -249,7 +249,9 @@ def test_words_outside_and_on_each_other_are_noticed(browser):
 
 @pytest.mark.slow
 def test_every_page_of_a_run(browser, solved, tmp_path):
-    folder = shutil.copytree(solved("lifted"), tmp_path / "run")
+    folder = shutil.copytree(
+        solved("lifted"), tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+    )
     quiet = [str(folder), "--quiet"]
     robustness(quiet)
     deploy(quiet)

@@ -317,7 +317,11 @@ def test_a_page_is_drawn_again_from_its_folder_alone(
 def test_a_run_without_one_gets_a_report_of_its_design(
     two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     for name in ("report.html", "report.json"):
         (folder / name).unlink(missing_ok=True)
 

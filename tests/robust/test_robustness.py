@@ -263,7 +263,11 @@ def test_a_wrong_option_is_named(
 
 
 def test_a_folder_that_holds_no_run(two_mass_run: Path, tmp_path: Path, capsys) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    folder = Path(
+        shutil.copytree(
+            two_mass_run, tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
+        )
+    )
     (folder / "controller.json").unlink()
     assert main([str(folder)]) == 2
     assert "solve the case first" in capsys.readouterr().err
