@@ -6,13 +6,14 @@ are given; steps are of the model and of the plants where the margins are least.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import frequency_and_damping
 from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import (
@@ -286,12 +287,86 @@ def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> 
     return np.asarray(np.arange(count) * steps.period), y.T
 
 
+@dataclass(frozen=True)
+class SecondCrossover:
+    """Frequencies `low` to `high` in rad/s above the crossover, where |L| exceeds 1 again, by
+    `peak` at most, and the plant does not raise it."""
+
+    low: float
+    high: float
+    peak: float
+
+
+def second_crossover(
+    omega: Array, L: np.ndarray, plant: Array, crossover: float
+) -> SecondCrossover | None:
+    """Find where the controller alone takes |L| above 1 again beyond the crossover.
+
+    A resonance of the plant that takes |L| above 1 raises |G| between the edge and the peak of
+    such a range, and is common practice where its phase is known. Where |G| falls on that way the
+    controller raises |L|: stability then rests on the plant's gain and phase at frequencies that
+    the bandwidth does not need, and for which the model is rarely made.
+
+    Parameters
+    ----------
+    omega : (n,) array
+        Ascending, rad/s.
+    L : (n,) array
+        The loop that is cut at one actuator or sensor, complex.
+    plant : (n,) array
+        |G| there: of that actuator over all outputs, or of that sensor over all actuators.
+    crossover : float
+        In rad/s, as `ClassicalMargins` has it.
+
+    Returns
+    -------
+    SecondCrossover or None
+        The one with the largest peak.
+    """
+    if not np.isfinite(crossover):
+        return None
+    size = np.where(omega > crossover, np.abs(L), 0.0)
+    inside = np.concatenate([[False], size > 1.0, [False]])
+    first, end = np.flatnonzero(np.diff(inside.astype(int))).reshape(-1, 2).T
+    # the crossover lies between two points of the grid: what is above 1 from there on is no return
+    returns = [(a, b) for a, b in zip(first, end, strict=True) if omega[a - 1] > crossover]
+    found = []
+    for a, b in returns:
+        top = a + int(size[a:b].argmax())
+        if plant[top] <= plant[a - 1]:
+            found.append(SecondCrossover(float(omega[a]), float(omega[b - 1]), float(size[top])))
+    return max(found, key=lambda one: one.peak, default=None)
+
+
+def _second_crossover_of(loop: Loop) -> SecondCrossover | None:
+    """The largest of the loops that are cut one at a time at the plant's inputs."""
+    omega = loop.grid()
+    G, K = loop.responses(omega)
+    found = []
+    for i in range(G.shape[2]):
+        L = equivalent_open_loop(K @ G, i)
+        at = classical_margins(partial(_cut, loop, i), omega).crossover
+        found.append(second_crossover(omega, L, np.linalg.norm(G[:, :, i], axis=1), at))
+    return _largest(found)
+
+
+def _cut(loop: Loop, i: int, omega: Array) -> np.ndarray:
+    G, K = loop.responses(omega)
+    return equivalent_open_loop(K @ G, i)
+
+
+def _largest(found: Sequence[SecondCrossover | None]) -> SecondCrossover | None:
+    return max((one for one in found if one), key=lambda one: one.peak, default=None)
+
+
 def loop_warnings(
     growth: float, dip: float, controller: StateSpace, bandwidth: float,
     rings: tuple[float, float] | None = None,
+    again: SecondCrossover | None = None,
     options: LoopFigureOptions = LoopFigureOptions(),
 ) -> list[str]:  # fmt: skip
-    """What an engineer would not build, in words: ω_b that is held by something narrow, or rings.
+    """What an engineer would not build, in words: ω_b that is held by something narrow, or rings,
+    or |L| that the controller takes above 1 again.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
     `dip`: as `bandwidth_dip` has it.
@@ -318,11 +393,16 @@ def loop_warnings(
             f"the closed loop rings at {rings[0] / HZ:.4g} Hz with damping {rings[1]:.3g}, within "
             "an octave of the bandwidth"
         )
+    if again is not None:
+        words.append(
+            f"|L| exceeds 1 again from {again.low / HZ:.4g} to {again.high / HZ:.4g} Hz, by "
+            f"{again.peak:.3g} at most: the controller raises it where the plant has no resonance"
+        )
     return words
 
 
 def measured_entry(
-    loops: Sequence[tuple[Array, np.ndarray]], controller: StateSpace, bandwidth: float,
+    loops: Sequence[tuple[Array, np.ndarray, Array]], controller: StateSpace, bandwidth: float,
     sensitivity_peak: float, options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:  # fmt: skip
     """As `loop_entry`, of loops that are known on lines of frequency; without steps.
@@ -331,8 +411,8 @@ def measured_entry(
 
     Parameters
     ----------
-    loops : sequence of (ω, L)
-        (k,) in rad/s, and L (k,) there.
+    loops : sequence of (ω, L, |G|)
+        (k,) in rad/s, L (k,) there, and (k,) the size of the plant's response there.
     controller : StateSpace
         SI.
     bandwidth, sensitivity_peak : float
@@ -345,20 +425,21 @@ def measured_entry(
     dict
         Keys of result.json.
     """
-    margins, growth, sizes = [], 1.0, []
-    for omega, L in loops:
+    margins, growth, sizes, again = [], 1.0, [], []
+    for omega, L, plant in loops:
         x, ln_L = np.log(omega), np.log(np.abs(L)) + 1j * np.unwrap(np.angle(L))
 
         def response(w: Array, x: Array = x, ln_L: np.ndarray = ln_L) -> np.ndarray:
             return np.exp(np.interp(np.log(w), x, ln_L))
 
         margins.append(classical_margins(response, omega))
+        again.append(second_crossover(omega, L, plant, margins[-1].crossover))
         S = np.abs(1.0 / (1.0 + response(bandwidth * options.above)))
         growth = max(growth, float((S / S[0]).max()))
         sizes.append(np.abs(1.0 / (1.0 + response(bandwidth * options.places))))
     return _entry(least_of(margins), sensitivity_peak) | {
         "loop_warnings": loop_warnings(
-            growth, _dip(sizes, options), controller, bandwidth, options=options
+            growth, _dip(sizes, options), controller, bandwidth, None, _largest(again), options
         )
     }
 
@@ -422,11 +503,13 @@ def loop_entry(
     poles = np.concatenate([loop.poles for loop in loops])
     rings = ringing(poles, bandwidth, options.ringing)
     dip = bandwidth_dip(loops, bandwidth, options)
+    again = _largest([_second_crossover_of(loop) for loop in loops])
+    warnings = loop_warnings(growth, dip, controller, bandwidth, rings, again, options)
     least = replace(least_of(margins), crossover=margins[0].crossover)
     return _entry(least, sensitivity_peak) | {
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
         "force_step_max": force.size,
         "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1)),
-        "loop_warnings": loop_warnings(growth, dip, controller, bandwidth, rings, options),
+        "loop_warnings": warnings,
     }

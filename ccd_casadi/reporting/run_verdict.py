@@ -30,7 +30,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which goes on from what is stored",
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
-    "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
+    "loop": "a smaller S_max; with sections bandwidth_least_hz, least_damping or weighted_level",
 }
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
     ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.inner_answer import InnerAnswer
@@ -88,7 +90,9 @@ def _loop_entry(case: MeasuredCase, design: MeasuredDesign) -> dict[str, Any]:
     K = design.controller
     if K is None or design.figures is None or not design.figures.stable:
         return {}
-    joints = [(HZ * one.hz, one.matrix @ controller_response(K, one.hz, case.period))
-              for one in case.responses]  # fmt: skip
-    loops = [(omega, equivalent_open_loop(L, i)) for omega, L in joints for i in range(L.shape[1])]
+    loops = []
+    for one in case.responses:
+        L = one.matrix @ controller_response(K, one.hz, case.period)
+        sizes = np.linalg.norm(one.matrix, axis=2)  # the loop is cut at an output
+        loops += [(HZ * one.hz, equivalent_open_loop(L, i), sizes[:, i]) for i in range(L.shape[1])]
     return measured_entry(loops, K, design.bandwidth, design.figures.S_peak)

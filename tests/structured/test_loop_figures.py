@@ -1,8 +1,9 @@
 """Margins, steps and warnings of a loop against what they mean."""
 
+import control as ct
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.fixed_structure_loops import FAST, LATE, loop, plant
 
@@ -191,7 +192,7 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
     omega = np.geomspace(1.0, 3000.0, 20_000)
     plant, controller = made.responses(omega)
     L = controller @ plant
-    lines = measured_entry([(omega, L[:, 0, 0])], K, w, 1.5)
+    lines = measured_entry([(omega, L[:, 0, 0], np.abs(plant[:, 0, 0]))], K, w, 1.5)
     exact = loop_entry([G], K, None, w, 1.5)
     assert lines["phase_margin_deg"] == pytest.approx(exact["phase_margin_deg"], abs=0.05)
     assert lines["gain_margin"] == pytest.approx(exact["gain_margin"], rel=1e-3)
@@ -246,3 +247,43 @@ def test_the_crossover_is_where_the_loop_falls_not_where_it_grazes(
     alone = omega[np.flatnonzero(np.abs(smooth(omega)) > 1.0)[-1]]
     assert len(falls) > 1, "the case has something to choose from"
     assert found == pytest.approx(alone, rel=0.15)
+
+
+def stage_and_lead(w: float, plant_mode: float, controller_mode: float) -> tuple[StateSpace, ...]:
+    """A mass with a collocated mode, PD with its crossover at w rad/s, and a resonance of K.
+
+    The modes are at 15 w and lightly damped; a size of 0 leaves one out.
+    """
+    s, mode_at = ct.tf("s"), 15.0 * w
+    band = 2.0 * 0.02 * mode_at * s / (s**2 + 2.0 * 0.02 * mode_at * s + mode_at**2)
+    plant = 1.0 / s**2 + plant_mode * band / (s * 2.0 * 0.02 * mode_at)
+    lead = w**2 / 3.0 * (3.0 * s / w + 1.0) / (s / (10.0 * w) + 1.0)
+    # of this sign L at its resonance is on the right-hand side, far from -1
+    return tuple(
+        StateSpace(each.A, each.B, each.C, each.D)
+        for each in map(ct.ss, (plant, lead * (1.0 - controller_mode * band)))
+    )
+
+
+@pytest.mark.parametrize("sampling", [None, Sampling(4000.0, 50.0)])
+@given(w=st.floats(20.0, 100.0))
+@settings(max_examples=10, deadline=None)
+def test_a_crossover_that_the_controller_adds_is_warned_of(
+    w: float, sampling: Sampling | None
+) -> None:
+    """By a resonance of K: a warning; by one of the plant, or by none: no word."""
+    entries = [
+        loop_entry([G], K, sampling, w / 2.0, 1.5)
+        for G, K in (stage_and_lead(w, *sizes) for sizes in ((0.0, 60.0), (2.0, 0.0), (0.0, 0.0)))
+    ]
+    again = [[x for x in e["loop_warnings"] if "exceeds 1 again" in x] for e in entries]
+    assert [len(one) for one in again] == [1, 0, 0]
+
+
+def test_lines_warn_of_the_second_crossover_of_the_model() -> None:
+    omega, w = np.geomspace(5.0, 5000.0, 20_000), 60.0
+    for sizes, count in (((0.0, 60.0), 1), ((2.0, 0.0), 0)):
+        G, K = stage_and_lead(w, *sizes)
+        plant, controller = (x[:, 0, 0] for x in Loop(G, K).responses(omega))
+        entry = measured_entry([(omega, plant * controller, np.abs(plant))], K, w / 2.0, 1.5)
+        assert sum("exceeds 1 again" in x for x in entry["loop_warnings"]) == count
