@@ -14,6 +14,7 @@ from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 
@@ -32,6 +33,7 @@ class BoxProofOptions:
     batch: int = 2_000  # boxes that are divided at a time, at most
     batches: int = 250  # at least, so that little is spent on the worst boxes alone
     decades: float = 6.0  # of frequency cells at the start; below them is one cell to 0
+    poles_apart: float = 1e-4  # of actuators and sensors behind a hold, relative: or no proof
     unit_frequency: float = 3.0  # over ω_b and the fastest pole: above it cells divide 1/ω
 
 
@@ -159,7 +161,10 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
     NOT_MODAL = "the plant is not modal: its damping couples the modes, or brakes a free body"
-    WIRED = "an actuator or a sensor has dynamics, so the set was searched"
+    WIRED = (
+        "channels have different actuators or sensors, or two of their poles coincide, so the set "
+        "was searched"
+    )
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
 
 
@@ -322,22 +327,33 @@ def prove(
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
-    if any(option.wiring for option in uncertain.options):
-        return Proof(ProofOutcome.WIRED, slack, names)
     families = []
     for option in range(len(models)):
+        low_pass = _low_pass(uncertain.options[option], sampling, options.poles_apart)
+        if low_pass is None:
+            return Proof(ProofOutcome.WIRED, slack, names)
         plant = modal_sum(uncertain, option, unit)
         if plant is None:
             why = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
             return Proof(why, slack, names)
         families.append(LoopFamily(
-            plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay
+            plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay,
+            tuple((low_pass / unit).tolist()),
         ))  # fmt: skip
     share, enough = (most_boxes or options.most_boxes) // len(models), None
     if many and most_boxes is None:
         share, enough = min(share, options.most_boxes_of_many), options.stuck_boxes_of_many
     proof = divide(families, uncertain.box, slack, share, workers, enough, options)
     return replace(proof, channels=any(own.given for own in bounds.channels))
+
+
+def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.ndarray | None:
+    """The poles in rad/s that actuators and sensors add; None where the enclosures have none."""
+    poles = system.wiring.poles(len(system.C), system.B.shape[1])
+    if poles is None or sampling is None:
+        return poles
+    distance = np.abs(poles[:, None] - poles) + np.diag(np.full(len(poles), np.inf))
+    return poles if (distance > apart * np.abs(poles)).all() else None
 
 
 def divide(

@@ -7,6 +7,7 @@ infinite at 0 Hz: at rest it is enclosed times y².
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from math import factorial
 from typing import Self
 
@@ -61,7 +62,15 @@ class Boxes:
 @dataclass(frozen=True)
 class FrequencyAxis:
     """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay.
-    `at_rest`: as they are there."""
+    `at_rest`: as they are there.
+
+    `low_pass` has the poles λ of W(s) = 1/Π(1 - s/λ), what actuator and sensor do to every mode g:
+    W g in continuous time. Behind a hold each pole of W g is held apart, its residues those of
+
+        W(s)/(s - p) = W(p)/(s - p) + Σ R_λ/((λ - p)(s - λ)),   R_λ the residue of W at λ
+
+    so that every mode g adds Σ R_λ g(λ) h_λ, h_λ being 1/(s - λ) with hold and delay.
+    """
 
     x: Affine
     y: Affine
@@ -70,12 +79,69 @@ class FrequencyAxis:
     period: float | None
     delay: float
     at_rest: bool
+    low_pass: tuple[complex, ...] = ()
 
-    def factor(self, p: Affine, residue: Affine) -> Pair:
-        """D and N of a pole, both times x; they vanish together nowhere."""
+    @cached_property
+    def residues(self) -> np.ndarray:
+        """R_λ of W."""
+        poles = np.array(self.low_pass)
+        others = 1.0 - poles[:, None] / poles
+        np.fill_diagonal(others, 1.0)
+        return np.asarray(-poles / others.prod(axis=1))
+
+    @cached_property
+    def passed(self) -> Affine:
+        """W at s = y/x, or at s."""
+        return self._passed(self.x, self.y) if self.period is None else self.passed_unheld
+
+    @cached_property
+    def passed_unheld(self) -> Affine:
+        """W at s, that of no hold."""
+        if self.period is None:
+            return self.passed
+        return self._passed(self.s * 0.0 + 1.0, self.s)
+
+    def _passed(self, x: Affine, y: Affine) -> Affine:
+        found = x * 0.0 + 1.0
+        for pole in self.low_pass:
+            found = found * x * inverse(x - y * (1.0 / pole))
+        return found
+
+    @cached_property
+    def held_low_pass(self) -> tuple[Affine, ...]:
+        """h_λ of every λ."""
+        one = self.x * 0.0
+        parts = (self.factor(one + pole, one + 1.0, bare=True) for pole in self.low_pass)
+        return tuple(N * inverse(D) for D, N in parts)
+
+    def lagged(self, gains: list[Affine]) -> Affine:
+        """Σ R_λ g(λ) h_λ of g(λ) for every λ; sampled."""
+        n = len(gains[0].slope)
+        total = gains[0] * 0.0
+        for R, gain, held in zip(self.residues, gains, self.held_low_pass, strict=True):
+            total = total + gain * held.of(n) * complex(R)
+        return total
+
+    def lagged_of(self, poles: list[Pair]) -> Affine | None:
+        """The same of g = Σ residue/(s - p); None where nothing is to be added."""
+        if self.period is None or not self.low_pass:
+            return None
+        gains = []
+        for pole in self.low_pass:
+            each = [residue * inverse(p * -1.0 + pole) for p, residue in poles]
+            gains.append(sum(each[1:], each[0]))
+        return self.lagged(gains)
+
+    def factor(self, p: Affine, residue: Affine, bare: bool = False) -> Pair:
+        """D and N of a pole, both times x; they vanish together nowhere. `bare`: without W, but for
+        which N has W(p) behind a hold."""
         n = len(p.slope)
         if self.period is None:
-            return self.y.of(n) - p * self.x.of(n), residue * self.x.of(n)
+            N = residue * self.x.of(n)
+            return self.y.of(n) - p * self.x.of(n), N if bare else N * self.passed.of(n)
+        if not bare:
+            for pole in self.low_pass:
+                residue = residue * inverse(p * (-1.0 / pole) + 1.0)
         T, turn = self.period, self.turn.of(n)
         whole, rest = delay_parts(T, self.delay)
         all_of, early = exponential(p * T), exponential(p * (T - rest))
@@ -97,21 +163,40 @@ class FrequencyAxis:
         n = len(square.slope)
         x, y = self.x.of(n), self.y.of(n)
         if self.period is None:
-            return x * x * inverse(y * y - square * x * x)
+            return x * x * inverse(y * y - square * x * x) * self.passed.of(n)
         T, turn = self.period, self.turn.of(n)
         whole, rest = delay_parts(T, self.delay)
         late, full, early = (_moved(square, time) for time in (T - rest, T, rest))
         N = late + (full * 2.0 - late - early) * turn + early * turn * turn
+        apart = turn * -1.0 + 1.0
+        if self.low_pass:  # W/(s² - q) = (a + bs)/(s² - q) + Σ R_λ/((λ² - q)(s - λ))
+            even, odd = self._even_and_odd(square)
+            below = inverse(even * even - square * odd * odd)
+            speed = _speed(square, T - rest) + _speed(square, rest) * turn
+            N = N * even * below - speed * apart * odd * below
         for _ in range(whole + 1):
             N = N * turn
-        apart = turn * -1.0 + 1.0
-        return N * inverse(apart * apart - square * full * turn * 2.0)
+        found = N * inverse(apart * apart - square * full * turn * 2.0)
+        if self.low_pass:
+            found += self.lagged([inverse(square * -1.0 + pole**2) for pole in self.low_pass])
+        return found
+
+    def _even_and_odd(self, square: Affine) -> tuple[Affine, Affine]:
+        """E and O of Π(1 - s/λ) = E(s²) + s O(s²)."""
+        parts = []
+        powers = np.poly(1.0 / np.array(self.low_pass)).real  # of s, from 0 on
+        for own in (powers[::2], powers[1::2]):
+            total = square * 0.0
+            for value in own[::-1]:
+                total = total * square + float(value)
+            parts.append(total)
+        return parts[0], parts[1]
 
     def driven_away_unheld(self, square: Affine) -> Affine:
         """The same without hold and delay."""
         n = len(square.slope)
         s = self.s.of(n)
-        return inverse(s * s - square)
+        return inverse(s * s - square) * self.passed_unheld.of(n)
 
     @property
     def free_body(self) -> Affine:
@@ -119,23 +204,33 @@ class FrequencyAxis:
         1/s² (`kernels.modes`):
 
         z⁻ᵈ ((h² + (T² - h²)/z)(1 - 1/z)/2 + T (h + (T - h)/z)/z)/T²
+
+        W adds W'(0)/s, of which y² makes W'(0) z⁻ᵈ (h + (T - h)/z) (x - yT/2) y/T, as 1 - 1/z =
+        Ty (x - yT/2), and R_λ/(λ² (s - λ)).
         """
         if self.period is None:
-            return self._per_y_squared(self.x * self.x)
+            return self._per_y_squared(self.x * self.x * self.passed)
         T, turn = self.period, self.turn
         whole, rest = delay_parts(T, self.delay)
         h = T - rest
         first = (turn * (T * T - h * h) + h * h) * (turn * -1.0 + 1.0) * 0.5
         found = (first + (turn * (T - h) + h) * turn * T) * (1.0 / T**2)
+        slope = sum(1.0 / pole for pole in self.low_pass).real if self.low_pass else 0.0
+        if self.low_pass:
+            back = self.x - self.y * (0.5 * T)
+            found = found + (turn * (T - h) + h) * back * self.y * (slope / T)
         for _ in range(whole):
             found = found * turn
+        if self.low_pass:
+            one = self.x * 0.0
+            found = found + self.y * self.y * self.lagged([one + p**-2 for p in self.low_pass])
         return self._per_y_squared(found)
 
     @property
     def free_body_unheld(self) -> Affine:
         """The same without hold and delay: sampled y²/s² = sinc²(ωT/2), |sinc''| <= 1/3."""
         if self.period is None:
-            return self._per_y_squared(self.x * self.x)
+            return self._per_y_squared(self.x * self.x * self.passed)
         half = self.s.centre.imag * 0.5 * self.period
         slope, width = self.s.slope.imag * 0.5 * self.period, np.abs(self.s.slope).sum(0)
         small = np.abs(half) < 1e-3  # there the series holds to rounding
@@ -144,7 +239,7 @@ class FrequencyAxis:
         steep = np.where(small, -half / 3.0, (np.cos(over) - np.sin(over) / over) / over)
         rest = (0.5 * self.period * width) ** 2 / 6.0 + 1e-12
         sinc = Affine(value, steep * slope, rest)
-        return self._per_y_squared(sinc * sinc)
+        return self._per_y_squared(sinc * sinc * self.passed_unheld)
 
     def _per_y_squared(self, form: Affine) -> Affine:
         """The form itself at rest, else over y²."""
@@ -155,29 +250,40 @@ def _moved(square: Affine, time: float, *, terms: int = 8, most: float = 1.0) ->
     """φ(x) = (cosh √q x - 1)/q = x²/2 Σ 2 uⁿ/(2n + 2)!, u = q x²: how far a unit force moves the
     body in the time x. What is left out from `terms` on is less than twice its first term where
     |u| is at most `most`, and unknown beyond."""
-    u = square * time**2
+    return _series(square * time**2, 1, terms, most) * (0.5 * time**2)
+
+
+def _speed(square: Affine, time: float, *, terms: int = 8, most: float = 1.0) -> Affine:
+    """sinh(√q x)/√q = x Σ uⁿ/(2n + 1)!: how fast a unit force has made it then, as `_moved`."""
+    return _series(square * time**2, 0, terms, most) * time
+
+
+def _series(u: Affine, first: int, terms: int, most: float) -> Affine:
+    """(1 + first)! Σ uⁿ/(2n + 1 + first)!."""
     total = u * 0.0 + 1.0
     for n in range(terms - 1, 0, -1):
-        total = u * total * (1.0 / ((2 * n + 1) * (2 * n + 2))) + 1.0
-    left = 4.0 / factorial(2 * terms + 2)
+        total = u * total * (1.0 / ((2 * n + first) * (2 * n + 1 + first))) + 1.0
+    left = 4.0 / factorial(2 * terms + 1 + first)
     rest = total.rest + np.where(u.size <= most, left, np.inf)
-    return Affine(total.centre, total.slope, rest) * (0.5 * time**2)
+    return Affine(total.centre, total.slope, rest)
 
 
 def axis_of(
-    boxes: Boxes, period: float | None, delay: float, at_rest: bool = False
-) -> FrequencyAxis:
+    boxes: Boxes, period: float | None, delay: float, at_rest: bool = False,
+    low_pass: tuple[complex, ...] = (),
+) -> FrequencyAxis:  # fmt: skip
     """The frequencies of boxes."""
     f = variable(boxes.low[0], boxes.high[0], 0, 1)
     if period is None:
         upper = boxes.chart == Chart.HIGH
         one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
         x, y = _either(upper, f, one), _either(upper, one, f) * 1j
-        return FrequencyAxis(x, y, y, one, None, 0.0, at_rest)
+        return FrequencyAxis(x, y, y, one, None, 0.0, at_rest, low_pass)
     half = exponential(f * 0.5j)
     back = exponential(f * -0.5j)
     x, y = (half + back) * 0.5, (half - back) * (1.0 / period)
-    return FrequencyAxis(x, y, f * (1j / period), back * back, period, delay, at_rest)
+    s = f * (1j / period)
+    return FrequencyAxis(x, y, s, back * back, period, delay, at_rest, low_pass)
 
 
 def gain_of(structure: Structure, kappa: Array, axis: FrequencyAxis, integrator: bool) -> Affine:

@@ -64,10 +64,11 @@ def discs_of(
         damped = damped & (decay >= 0.0)
         T = axis.period  # of Re D, what it is not below
         least = decay * axis.x.lowest if T is None else -np.expm1(-decay * T)
-        _fill(held, i, rows, [axis.factor(*pole) for pole in poles], least, strength)
+        factors, beside = [axis.factor(*pole) for pole in poles], axis.lagged_of(poles)
+        _fill(held, i, rows, factors, least, strength, beside)
         if free:
-            s = axis.s.of(len(rows))
-            _fill(bare, i, rows, [(s - p, residue) for p, residue in poles], decay, strength)
+            s, W = axis.s.of(len(rows)), axis.passed_unheld.of(len(rows))
+            _fill(bare, i, rows, [(s - p, residue * W) for p, residue in poles], decay, strength)
     if q:  # where modes are not enclosed their parameters are divided before anything else
         held.shares[:, -q:] = np.where(known, held.shares[:, -q:], 1e30 * (high - low)[-q:])
     return held, bare if free else held, damped
@@ -80,16 +81,20 @@ def _fill_form(discs: Discs, i: int, rows: list[int], form: Affine) -> None:
 
 
 def _fill(
-    discs: Discs, i: int, rows: list[int], poles: list[Pair], least: Array, strength: Affine | None
-) -> None:
+    discs: Discs, i: int, rows: list[int], poles: list[Pair], least: Array,
+    strength: Affine | None, beside: Affine | None = None,
+) -> None:  # fmt: skip
     """Mode i's disc: of both poles as one form, since far above a resonance they nearly cancel, or
-    a disc of each; times its strength, which may pass through 0."""
+    a disc of each, and of what lies `beside` them; times its strength, which may pass through 0."""
     (D, N), (E, M) = poles
     first, second = inverse(D), inverse(E)
     whole = N * first + M * second
     one, two = quotient(N, D, least, first), quotient(M, E, least, second)
     middle, apart = one[0] + two[0], one[1] + two[1]
     moves = one[2] + two[2]
+    if beside is not None:
+        whole, middle = whole + beside, middle + beside.centre
+        apart, moves = apart + beside.reach + beside.rest, moves + beside.reaches
     if strength is not None:
         whole, size, most = whole * strength, strength.middle, np.abs(middle) + apart
         apart = size * apart + (strength.reach + strength.rest) * most

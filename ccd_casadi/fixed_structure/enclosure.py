@@ -204,7 +204,8 @@ class LoopFamily:
     """One option's loops with one controller over the box of `names`; time in 1/`unit`.
 
     `parts`: structure and κ of each channel, `outputs` (p, p) and `inputs` (m, p) their directions.
-    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s.
+    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s. `low_pass`: the poles, in that
+    time, of what actuators and sensors do to every channel.
     """
 
     plant: ModalSum
@@ -217,6 +218,7 @@ class LoopFamily:
     unit: float
     period: float | None
     delay: float
+    low_pass: tuple[complex, ...] = ()
     options: EnclosureOptions = EnclosureOptions()
 
     def enclose(self, boxes: Boxes) -> Enclosures:
@@ -308,7 +310,7 @@ class LoopFamily:
 
     def _loop_discs(self, boxes: Boxes) -> LoopDiscs:
         """(1) to (10) on boxes; where one of them does not hold it is one that does."""
-        axis = axis_of(boxes, self.period, self.delay)
+        axis = axis_of(boxes, self.period, self.delay, low_pass=self.low_pass)
         held, free, damped = self._discs(boxes, axis)
         gains, epsilon, bounded, grain = self._gains(axis)
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
@@ -367,7 +369,7 @@ class LoopFamily:
 
         with F_K the gains that are bounded only; δ has their part and the rounding, too.
         """
-        axis = axis_of(boxes, self.period, self.delay, at_rest=True)
+        axis = axis_of(boxes, self.period, self.delay, True, self.low_pass)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
         held, free, damped = self._discs(boxes, axis)
         gains, epsilon, _, grain = self._gains(axis)

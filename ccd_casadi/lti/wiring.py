@@ -76,6 +76,16 @@ class Filters:
         return StateSpace(*(block_diag(*(getattr(one, name) for one in parts)) for name in "ABCD"))
 
 
+    def poles(self, channels: int, key: str) -> np.ndarray | None:
+        """The poles λ in rad/s of what all channels share, 1/Π(1 - s/λ); None where they differ."""
+        system = self.system(channels, key)
+        each = np.split(np.arange(len(system.A)), channels)
+        A = system.A[np.ix_(each[0], each[0])]
+        if any((system.A[np.ix_(own, own)] != A).any() for own in each):
+            return None
+        return np.asarray(np.linalg.eigvals(A), complex)
+
+
 def _entry(values: tuple[float, ...], i: int, channels: int, key: str) -> float:
     if len(values) not in (1, channels):
         raise PlantError(f"{key} has {len(values)} entries for {channels} channels; give one, or "
@@ -99,6 +109,12 @@ class Wiring:
         both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
         there = [f"{name} {own.words}" for name, own in both if own]
         return f"{' and '.join(there)} in every loop; forces of GS and of steps enter before it"
+
+    def poles(self, outputs: int, inputs: int) -> np.ndarray | None:
+        """The poles λ in rad/s of 1/Π(1 - s/λ) where the wiring is that of every channel alike."""
+        actuator = self.actuator.poles(inputs, "actuator")
+        sensor = self.sensor.poles(outputs, "sensor")
+        return None if actuator is None or sensor is None else np.append(actuator, sensor)
 
     def around(self, plant: StateSpace) -> StateSpace:
         """The plant (p x m, time in s) with its actuators and sensors."""
