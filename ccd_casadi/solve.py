@@ -94,7 +94,8 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
             say(f"warning: {words}", sys.stderr)
         return
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
-    say(f"note: in SI, at the start: {size_words(facts[0], case)}", sys.stderr)
+    if sizes := size_words(facts[0], case):
+        say(f"note: in SI, at the start: {sizes}", sys.stderr)
     for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
             of_case = item.topic in (Topic.UNITS, Topic.LOOP, Topic.UNUSED)
