@@ -1,4 +1,4 @@
-"""`python -m ccd_casadi.report RUN_DIR`: the pages of a folder drawn again from what it holds.
+"""`python -m ccd_casadi.report RUN_DIR [--brief]`: the pages of a folder drawn again.
 
 Nothing is designed: what the pages show is in report.json. A run that kept none gets a report of
 its design, as far as case.toml, controller.json and result.json hold it.
@@ -6,13 +6,16 @@ its design, as far as case.toml, controller.json and result.json hold it.
 
 import argparse
 
-from ccd_casadi.support.command_line import RUN, ExitCode, command
+from ccd_casadi.support.command_line import RUN, ExitCode, command, option
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import inform
 
 
 @command(
     "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
+    option("--brief", action="store_true",
+           help="write brief.html alone, one A4 page for a decision; a PDF too where a Chromium or "
+                "Chrome is on the PATH"),
     needs=["ccd_casadi.drawing.paint"], place=RUN,
     without_effect=["--out", "--workers", "--seed"],
 )  # fmt: skip
@@ -26,6 +29,15 @@ def main(options: argparse.Namespace) -> ExitCode:
     folder = options.run
     if not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
+    if options.brief:
+        from ccd_casadi.reporting.brief import write_brief
+
+        written = write_brief(read_run(folder))
+        write_index(folder)
+        inform("\n".join(f"written       {path}" for path in written))
+        if len(written) == 1:
+            inform("no PDF        no Chromium or Chrome is on the PATH; print brief.html")
+        return ExitCode.DONE
     below = (path.parent for path in sorted(folder.glob(f"*/{NAME}")))
     drawn = []
     for place in (folder, *(own for own in below if not (own / "result.json").exists())):

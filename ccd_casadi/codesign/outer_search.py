@@ -12,6 +12,7 @@ from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
+from ccd_casadi.codesign.result_entries import start_entry
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
@@ -296,6 +297,7 @@ def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     outcome = replace(outcome, surrogates=surrogates)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.look)
+    result["start"] = start_entry(sampler)
     return Solution(result, outcome, verified, quality)
 
 

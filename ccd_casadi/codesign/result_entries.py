@@ -18,12 +18,14 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
@@ -417,3 +419,29 @@ def box_words(
     else:
         words = f"{within} on {where}, but not all along its common resonance shift"
     return {"own": own, "own_words": words, "figures": figures}
+
+
+def start_entry(sampler: Sampler) -> dict[str, Any]:
+    """The design at the start of θ as the run has met it, for result.json.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the run.
+
+    Returns
+    -------
+    dict
+        `theta`, `hardware_cost`, and `bandwidth_hz` of the best controller there, None where the
+        run has searched none or found none.
+    """
+    problem = sampler.problem
+    found = [entry.bandwidth for entry in sampler.trace
+             if entry.theta == problem.start and math.isfinite(entry.bandwidth)]  # fmt: skip
+    if sampler.bandwidth_at_start is not None:
+        found.append(sampler.bandwidth_at_start)
+    return {
+        "theta": dict(zip(problem.names, problem.start, strict=True)),
+        "hardware_cost": hardware_cost(plant_of(problem), problem.start),
+        "bandwidth_hz": max(found) / HZ if found else None,
+    }

@@ -37,12 +37,14 @@ from ccd_casadi.support.terminal import Tell, remark
 @dataclass(frozen=True)
 class InitialSearch:
     """Warm starts (κ in SI: `anchors`) and plants (`members`) of the search at the start, by the
-    names that stores use; `words`: why there are none."""
+    names that stores use; `words`: why there are none. `bandwidth` in rad/s of the controller that
+    was found at the start, which a store of an earlier version has not."""
 
     anchors: tuple[tuple[float, ...], ...]
     members: tuple[Scenario, ...]
     error_anchors: tuple[tuple[float, ...], ...]
     words: str
+    bandwidth: float | None = None
 
 
 def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, str]:
@@ -64,10 +66,14 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
             # No plant was found worse: this is the search that an end at the start needs.
             make = partial(ProblemAt(anchored, start).value_of, made, 1)
             sampler.of(anchored).cached("race", start, StructuredValue, make)
-        return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
+        bandwidth = made.bandwidth if made.certified else None
+        return InitialSearch(
+            own.warm_starts, own.scenarios, own.error_warm_starts, words, bandwidth
+        )
 
     key = sample_key(owner, problem.start)
     found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
+    sampler.bandwidth_at_start = found.bandwidth
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
     return with_structured(problem, **known, scenarios=found.members), found.words
 

@@ -204,8 +204,8 @@ class LoopFamily:
     """One option's loops with one controller over the box of `names`; time in 1/`unit`.
 
     `parts`: structure and κ of each channel, `outputs` (p, p) and `inputs` (m, p) their directions.
-    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s. `low_pass`: the poles, in that
-    time, of what actuators and sensors do to every channel.
+    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s.
+    `low_pass`: the poles, in that time, of what actuators and sensors do to every channel.
     """
 
     plant: ModalSum

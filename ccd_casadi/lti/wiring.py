@@ -75,7 +75,6 @@ class Filters:
             parts.append(own)
         return StateSpace(*(block_diag(*(getattr(one, name) for one in parts)) for name in "ABCD"))
 
-
     def poles(self, channels: int, key: str) -> np.ndarray | None:
         """The poles λ in rad/s of what all channels share, 1/Π(1 - s/λ); None where they differ."""
         system = self.system(channels, key)

@@ -93,6 +93,8 @@ class Sampler:
         Of the infeasible ones.
     improvements : int
         Times that a better controller was found where one had been known.
+    bandwidth_at_start : float or None
+        In rad/s, of a search at the start of θ that no sample holds.
     """
 
     chunk = 8  # single designs a unit at most
@@ -113,6 +115,7 @@ class Sampler:
         self.solved: dict[tuple[float, ...], InnerSample] = {}
         self.whole = True  # not of a part of the box, whose best may be worse than another's
         self.improvements = 0
+        self.bandwidth_at_start: float | None = None
         self._tried: dict[tuple[float, ...], list[tuple[float, ...]]] = {}  # κ, in vain
 
     def of(
@@ -126,7 +129,7 @@ class Sampler:
         other.spent = self.spent
         other.whole = traced
         if traced:
-            other.trace = self.trace
+            other.trace, other.bandwidth_at_start = self.trace, self.bandwidth_at_start
         return other
 
     @property

@@ -1,0 +1,357 @@
+"""The brief: one A4 page about a finished run for somebody who decides, and saw nothing else of it.
+
+Decision, hardware and figures before and after, the requirements as bars, the machine, |S| of the
+loop, what limits it, what happens if the model is wrong, and the risks. All figures are those of
+`result.json`; nothing is designed.
+"""
+
+import math
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.lines import panel_html
+from ccd_casadi.drawing.paint import CSS, block_html, typeset
+from ccd_casadi.inner_problem.controller_problem import FIGURES
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.reporting.facts import binding, conclusion, cost_words, run_name
+from ccd_casadi.reporting.gain_figures import S_panel, run_view
+from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
+from ccd_casadi.reporting.nyquist import nyquist_panel
+from ccd_casadi.reporting.run_verdict import advice, lines_of, loop_concerns, unproven
+from ccd_casadi.reporting.structured_page import binding_words
+from ccd_casadi.support.text import HZ, display_unit, number, template, with_unit
+from surrogates.files import write_whole
+
+NAME = "brief.html"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
+
+
+@dataclass(frozen=True)
+class BriefOptions:
+    """What the brief asks of the design.
+
+    Attributes
+    ----------
+    limits, risks, requirements : int
+        Of each at most; requirements are those with the least left.
+    shift : float
+        Of all resonances, relative: "3 % lower".
+    gain : float
+        Of the whole plant, relative.
+    resonances : int
+        That are compared before and after.
+    height : float
+        Of |S|, inches.
+    print_seconds : float
+        For a browser to write the PDF.
+    """
+
+    limits: int = 3
+    risks: int = 3
+    requirements: int = 7
+    shift: float = 0.03
+    gain: float = 0.1
+    resonances: int = 3
+    height: float = 2.9
+    print_seconds: float = 60.0
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """A row of the comparison, in words; `change` is empty where there is none to state."""
+
+    name: str
+    before: str
+    after: str
+    change: str
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A requirement: what share of it is used, 1 at its limit; nan where that is not known."""
+
+    name: str
+    required: str
+    achieved: str
+    used: float
+    margin: str
+    where: str
+    evidence: str
+
+
+def write_brief(run: FinishedRun, options: BriefOptions = BriefOptions()) -> list[Path]:
+    """Write brief.html of a run, and brief.pdf where a Chromium is on the PATH to print it.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    options : BriefOptions
+
+    Returns
+    -------
+    list of Path
+        What was written.
+    """
+    page = run.folder / NAME
+    write_whole(page, brief_html(run, options))
+    pdf = page.with_suffix(".pdf")
+    return [page, *([pdf] if _printed(page, pdf, options) else [])]
+
+
+def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
+    """The page as a document of its own, without scripts or requests.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    options : BriefOptions
+
+    Returns
+    -------
+    str
+    """
+    result, problem = run.result, run.problem
+    decision = advice(result) or "Not judged."
+    colour = "good" if decision == "Build this." else "warn"
+    colour = "bad" if decision.startswith("Do not") else colour
+    view = run_view(run)
+    panel = panel_html(S_panel(view), 2, options.height, "S", "|S| of the loop")
+    names = ("the model", "the others") if view.scalar else ("an eigenvalue of L", "the others")
+    locus = nyquist_panel(view.hz, loci(view), problem.inner.S_max, options.height, names)
+    machine = machines(run)
+    return template("drawing/assets/brief.html", typeset=typeset).render(
+        css=Markup(CSS), name=run_name(run.case.path), decision=decision, colour=colour,
+        lead=conclusion(result), rows=list(before_and_after(run, options)),
+        bars=nearest(list(bars(result)), options.requirements), machine=machine, S=Markup(panel),
+        L=None if machine else Markup(panel_html(locus, 2, options.height, "L", "L of the loop")),
+        limits=_limits(problem, result)[: options.limits], ifs=list(what_if(result, options)),
+        risks=risks(result)[: options.risks], evidence=_evidence(result),
+        footer=_footer(run),
+    )  # fmt: skip
+
+
+def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[BeforeAfter]:
+    """Hardware, cost, figure of the objective and first resonances at the start and the optimum."""
+    result, problem = run.result, run.problem
+    started = result.get("start") or {}
+    for name, unit, begun in zip(problem.names, problem.units, problem.start, strict=True):
+        value = result["theta"][name]
+        shown, factor = display_unit(unit, max(abs(value), abs(begun)))
+        before, after = (f"{number(factor * v)} {shown}".strip() for v in (begun, value))
+        yield BeforeAfter(name, before, after, _change(begun, value))
+    for name, value in result.get("fixed", {}).items():
+        shown, factor = display_unit(problem.parameter_units[name], value)
+        words = f"{number(factor * value)} {shown}".strip()
+        chosen = name in result.get("listed", {}).get("values", {})
+        yield BeforeAfter(name, "from a list" if chosen else words, words, "")
+    cost = hardware_cost(plant_of(problem), problem.start)  # of what a list holds now
+    before = cost_words({**result, "hardware_cost": cost})
+    yield BeforeAfter("hardware cost", before, cost_words(result),
+                      _change(cost, result["hardware_cost"]))  # fmt: skip
+    first, last = started.get("bandwidth_hz"), result["bandwidth_hz"]
+    found = "not searched" if first is None else f"{number(first, 4)} Hz"
+    yield BeforeAfter("bandwidth of the best loop", found, f"{number(last, 4)} Hz",
+                      _change(first, last))  # fmt: skip
+    pairs = [_resonances(problem, theta) for theta in (problem.start, run.theta)]
+    for i, (one, other) in enumerate(zip(*pairs, strict=False), 1):
+        if i <= options.resonances:
+            before, after = (f"{number(hz, 4)} Hz" for hz in (one, other))
+            yield BeforeAfter(f"resonance {i}", before, after, _change(one, other))
+
+
+def _resonances(problem: CoDesignProblem, theta: tuple[float, ...]) -> list[float]:
+    modal = free_modal(problem, mechanics(plant_of(problem), theta, derivatives=False))
+    return [float(hz) for hz in sorted(modal.natural[~modal.rigid & ~modal.driven_away] / HZ)]
+
+
+def _change(before: float | None, after: float) -> str:
+    if before is None or before == 0.0:
+        return ""
+    percent = 100.0 * (after / before - 1.0)
+    return "unchanged" if abs(percent) < 0.05 else f"{percent:+.1f} %"
+
+
+def bars(result: Mapping[str, Any]) -> Iterator[Bar]:
+    """Every requirement with the share of it that is used."""
+    for one in result.get("requirements", ()):
+        achieved, margin, hz = (one[key] for key in ("achieved", "margin", "frequency_hz"))
+        where = ("" if hz is None else f"{number(hz, 4)} Hz", one["plant"])
+        yield Bar(
+            one["name"], f"{one['required']:.4g}",
+            "not known" if achieved is None else _small_as_zero(achieved, one["required"]),
+            float("nan") if margin is None else 1.0 - margin,
+            "not known" if margin is None else f"{_percent(margin, 1)} %",
+            ", ".join(filter(None, where)), one["evidence"],
+        )  # fmt: skip
+
+
+def nearest(found: list[Bar], most: int) -> list[Bar]:
+    """Those with the least left, in their order; one that is not known counts as missed."""
+    used = [-math.inf if math.isnan(bar.used) else -bar.used for bar in found]
+    kept = sorted(sorted(range(len(found)), key=lambda i: used[i])[:most])
+    return [found[i] for i in kept]
+
+
+def _percent(share: float, digits: int) -> str:
+    """Without the sign of a zero."""
+    rounded = round(100.0 * share, digits)
+    return f"{rounded + 0.0:.{digits}f}"
+
+
+def _small_as_zero(achieved: float, required: float, *, least: float = 1e-6) -> str:
+    """A constraint that binds at 0 is 0 but for the solver's rounding."""
+    return "0" if required == 0.0 and abs(achieved) < least else f"{achieved:.4g}"
+
+
+def what_if(result: Mapping[str, Any], options: BriefOptions) -> Iterator[tuple[str, str]]:
+    """What becomes of the loop where the machine differs from its model: (if, then)."""
+    line = result.get("verdict", {}).get("survives", {})
+    percent = f"{100.0 * options.shift:g} %"
+    for word, end, sign in (("lower", 0, -1.0), ("higher", 1, 1.0)):
+        stable, kept = line.get("stable_shift"), line.get("S_max_shift")
+        if stable is not None and kept is not None:
+            then = f"unstable: it is stable to {100.0 * stable[end]:+.3g} %"
+            if sign * stable[end] >= options.shift:
+                kept_to = _percent(abs(kept[end]), 1)
+                then = "stable, and |S| exceeds S_max"
+                then += f" from {kept_to} % on" if float(kept_to) else " at once"
+            if sign * kept[end] >= options.shift:
+                then = "stable and within S_max"
+            yield f"all resonances are {percent} {word}", then
+    margin = line.get("gain_margin")
+    if margin is not None:
+        low, high = margin
+        fails = not low <= 1.0 - options.gain <= 1.0 + options.gain <= high
+        then = "unstable" if fails else "stable"
+        most = f"; the gain may be {number(low, 2)} to {number(high, 3)} times the model's"
+        yield f"the plant's gain is off by {100.0 * options.gain:g} %", then + most
+    late, deploy = result.get("delay_margin_us"), result.get("verdict", {}).get("deployable", {})
+    rate = deploy.get("rate_hz")
+    if late is not None and rate:
+        period = 1e6 / rate
+        then = "stable" if late > period else "unstable"
+        yield (
+            "one sample more of delay",
+            f"{then}; the delay margin is {number(late / period, 3)} samples",
+        )
+
+
+def risks(result: Mapping[str, Any], *, identified: float = 0.1) -> list[str]:
+    """What may go wrong, the most serious first; what has no check is among them.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    identified : float
+        Relative: resonances are known that well.
+
+    Returns
+    -------
+    list of str
+        Sentences.
+    """
+    found = [
+        f"{line.name} {line.state}: {line.words}" for line in lines_of(result)
+        if line.state == State.FAILED
+    ]  # fmt: skip
+    survives = result.get("verdict", {}).get("survives", {})
+    if unproven(result) is not None:
+        found.append(f"The [robust] set is {unproven(result)}.")
+    elif survives.get("set") == "unproven":
+        found.append("The bounds are kept on all plants that were drawn from the [robust] set, and "
+                     "are not proven on all of it.")  # fmt: skip
+    elif not survives.get("robust_set"):
+        found.append("The case names no [robust] set: the loop is judged on its model alone.")
+    found += [f"{words[:1].upper()}{words[1:]}." for words in loop_concerns(result)]
+    if (result.get("time_budget") or {}).get("ended"):
+        found.append("The search was ended by its time budget: a better design may exist.")
+    if "deployable" in result.get("verdict", {}):
+        unknown = result["verdict"]["deployable"]["state"] == State.UNKNOWN
+        found += ["Hold and delay of the real-time system are not judged yet."] * unknown
+    shift = survives.get("S_max_shift")
+    if shift is not None and min(abs(end) for end in shift) < identified:
+        ends = f"{_percent(shift[0], 1)} to +{_percent(shift[1], 1)} %"
+        found.append(f"|S| stays within S_max for resonances {ends} off their model: identify "
+                     "them that well.")  # fmt: skip
+    phase, gain = result.get("phase_margin_deg"), result.get("gain_margin")
+    if phase is not None and gain is not None:
+        margins = f"{number(phase, 3)}° of phase and a gain of {number(gain, 3)}, up or down"
+        found.append(f"The least margins are {margins}; unmodelled dynamics use them up.")
+    found.append("Friction, saturation and noise are in no figure of this page unless [move] or "
+                 "[budget] names them.")  # fmt: skip
+    return found
+
+
+def _limits(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
+    binds = (binding_words if "proof" in result else binding)(problem, result)
+    return binds or ["Nothing binds: an interior optimum."]
+
+
+def _evidence(result: Mapping[str, Any]) -> str:
+    judge = result.get("judge", {})
+    second = result.get("second_engine", {}).get("words", "")
+    words = [f"An independent judge (NumPy, on the matrices as written): {judge.get('words', '')}"]
+    return ". ".join(filter(None, (*words, second))) + "."
+
+
+def _footer(run: FinishedRun) -> str:
+    result, value = run.result, FIGURES[run.result.get("minimise", "bandwidth")]
+    rate = "" if run.problem.sampling is None else f"{number(run.problem.sampling.rate_hz)} Hz, "
+    delay = "" if not rate else f"delay {with_unit(run.problem.sampling.delay, 's')}, "  # type: ignore[union-attr]
+    order = result.get("controller", {}).get("order")
+    controller = "" if order is None else f"controller of order {order}, "
+    version = result.get("versions", {}).get("ccd-casadi", "")
+    J = f"J = {number(result['objective'], 5)} of cost and {value.words}"
+    run_by = f"seed {result['seed']}, ccd-casadi {version}"
+    return f"{run.case.path.name}: {J}; {controller}{rate}{delay}{run_by}"
+
+
+def machines(run: FinishedRun) -> list[tuple[str, Markup]]:
+    """The machine before and after at one scale: its drawing, its masses and springs, or none."""
+    problem, plant = run.problem, plant_of(run.problem)
+    thetas = {"before": problem.start, "after": run.theta}
+    if plant.drawing is not None:
+        block = plant.drawing(thetas)
+        drawn = block.drawing if isinstance(block, c.Figure) else block
+        return [("before and after", block_html(drawn, "machine"))]
+    systems = {name: mechanics(plant, theta, derivatives=False) for name, theta in thetas.items()}
+    found = {name: lumped(system) for name, system in systems.items()}
+    if any(one is None for one in found.values()):
+        return []
+    most = max(float(abs(one.masses).max()) for one in found.values() if one is not None)
+    return [
+        (
+            name,
+            block_html(c.Picture(lumped_svg(one, free_modal(problem, systems[name]), most)), name),
+        )
+        for name, one in found.items()
+        if one is not None
+    ]
+
+
+def _printed(page: Path, pdf: Path, options: BriefOptions) -> bool:
+    """Whether a browser has printed the page."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        return False
+    rights = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+    pdf.unlink(missing_ok=True)
+    words = ["--headless", *rights, "--disable-gpu", "--no-pdf-header-footer",
+             f"--print-to-pdf={pdf}", page.resolve().as_uri()]  # fmt: skip
+    try:
+        subprocess.run([browser, *words], capture_output=True, timeout=options.print_seconds)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return pdf.exists()
