@@ -1,10 +1,12 @@
-"""`python -m ccd_casadi.report RUN_DIR [--brief]`: the pages of a folder drawn again.
+"""`python -m ccd_casadi.report RUN_DIR [RUN_B] [--brief]`: the pages of a folder drawn again, one
+page for a decision, or what changed from one run to another.
 
 Nothing is designed: what the pages show is in report.json. A run that kept none gets a report of
 its design, as far as case.toml, controller.json and result.json hold it.
 """
 
 import argparse
+from pathlib import Path
 
 from ccd_casadi.support.command_line import RUN, ExitCode, command, option
 from ccd_casadi.support.errors import UserError
@@ -13,6 +15,8 @@ from ccd_casadi.support.terminal import inform
 
 @command(
     "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
+    option("other", metavar="RUN_B", nargs="?", type=Path,
+           help="another finished run: writes changes.html into it, what changed from RUN_DIR"),
     option("--brief", action="store_true",
            help="write brief.html alone, one A4 page for a decision; a PDF too where a Chromium or "
                 "Chrome is on the PATH"),
@@ -29,6 +33,18 @@ def main(options: argparse.Namespace) -> ExitCode:
     folder = options.run
     if not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
+    if options.other is not None:
+        from ccd_casadi.reporting.run_changes import figure_rows, write_changes
+
+        if options.brief:
+            raise UserError("--brief: is of one run; give RUN_DIR alone")
+        runs = read_run(folder), read_run(options.other)
+        for name, *values in figure_rows(*runs):
+            inform(f"{name:26s}{values[0]:>18s}{values[1]:>18s}{values[2]:>12s}".rstrip())
+        path = write_changes(*runs)
+        write_index(options.other)
+        inform(f"written       {path}")
+        return ExitCode.DONE
     if options.brief:
         from ccd_casadi.reporting.brief import write_brief
 

@@ -309,6 +309,7 @@ def head_words(result: Mapping[str, Any]) -> str:
 PAGES = {
     "report.html": "the machine, its loop, what binds, how it was found",
     "brief.html": "one A4 page for a decision",
+    "changes.html": "what changed from another run",
     "insight.html": "the front of cost against bandwidth, and what loosening each bound would gain",
     "robustness.html": "margins, plants off the model, hardware tolerances, a move",
     "*/report.html": "order, rate, code, the move on the machine",

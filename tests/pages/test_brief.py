@@ -83,3 +83,27 @@ def test_the_brief_of_a_run(two_mass_run: Path, tmp_path: Path) -> None:
         assert one["name"] in text
     assert "<script" not in page
     assert brief_html(run) == page
+
+
+def test_what_changed_between_two_runs(two_mass_run: Path, tmp_path: Path, capsys) -> None:
+    """A run against one with another case: its figure, its requirement, its line of the case."""
+    folders = [tmp_path / name for name in ("before", "after")]
+    for folder in folders:
+        shutil.copytree(two_mass_run, folder, ignore=shutil.ignore_patterns("*-wal", "*-shm"))
+    result = json.loads((folders[1] / "result.json").read_text())
+    result["objective"] *= 1.25
+    result["requirements"][0]["achieved"] *= 0.5
+    (folders[1] / "result.json").write_text(json.dumps(result))
+    case = folders[1] / "case.toml"
+    case.write_text(re.sub(r"(?m)^w1 = .*$", "w1 = 3.25", case.read_text()))
+    assert report.main([str(folder) for folder in folders]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (J,) = (line for line in lines if line.startswith("J "))
+    assert J.endswith("+25.00 %")
+    (bandwidth,) = (line for line in lines if line.startswith("bandwidth "))
+    assert bandwidth.endswith("none")
+    page = (folders[1] / "changes.html").read_text()
+    assert "+w1 = 3.25" in page
+    assert f"{result['requirements'][0]['achieved']:.5g} of" in page
+    assert "what changed from another run" in (folders[1] / "index.html").read_text()
+    assert report.main([str(folders[0]), str(folders[1]), "--brief"]) == 2
