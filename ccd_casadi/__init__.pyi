@@ -34,6 +34,8 @@ from ccd_casadi.studies.tuning import tune as tune
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.text import HZ as HZ
 from ccd_casadi.synthesis.choice import choose_inputs as choose_inputs
+from ccd_casadi.synthesis.general_hinf import hinfsyn as hinfsyn
+from ccd_casadi.synthesis.general_hinf import mixsyn as mixsyn
 from ccd_casadi.synthesis.interchange import plant_from_control as plant_from_control
 from ccd_casadi.synthesis.synthesis import synthesise as synthesise
 from ccd_casadi.synthesis.weights import Weights as Weights
