@@ -21,7 +21,7 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunT
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.requirements import requirements
-from ccd_casadi.codesign.result_entries import budget_entry, move_entry
+from ccd_casadi.codesign.result_entries import budget_entry, iso_entry, move_entry
 from ccd_casadi.codesign.verdict import (
     State,
     VerdictLine,
@@ -123,6 +123,7 @@ def result_dict(
         **evidence,
         **budget_entry(problem, verified.theta, verified.controller),
         **move_entry(problem, verified.theta, verified.controller),
+        **iso_entry(problem, verified.theta, {**figures, **evidence}),
     }
     return json_values(result)
 

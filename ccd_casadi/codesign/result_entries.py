@@ -1,8 +1,8 @@
 """Designs as entries of result.json and controller.json."""
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.statics import compliance_words, statics
@@ -419,6 +419,46 @@ def box_words(
     else:
         words = f"{within} on {where}, but not all along its common resonance shift"
     return {"own": own, "own_words": words, "figures": figures}
+
+
+@dataclass(frozen=True)
+class IsoZones:
+    """ISO 14839-3: the peak of the sensitivity below which a rotor on magnets is in zone A
+    (9.5 dB), B (12 dB) or C (14 dB); above that it is in zone D."""
+
+    A: float = 3.0
+    B: float = 4.0
+    C: float = 5.0
+
+    def of(self, peak: float) -> str:
+        """The zone of a peak."""
+        return next((name for name, most in vars(self).items() if peak < most), "D")
+
+
+def iso_entry(
+    problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The zone of ISO 14839-3 of a plant that its stiffness drives away, for result.json.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    theta : sequence of float
+        SI.
+    result : mapping
+        `sensitivity_peak`, and `robust` of a set.
+
+    Returns
+    -------
+    dict
+        `iso_14839_3` with its zone and the peak of all plants; empty of other plants.
+    """
+    system = mechanics(plant_of(problem), theta, derivatives=False)
+    if not free_modal(problem, system).driven_away.any():
+        return {}
+    known = (result.get("robust") or {}).get("worst_sensitivity_peak")
+    peak = max(result["sensitivity_peak"], known or 0.0)
+    return {"iso_14839_3": {"zone": IsoZones().of(peak), "sensitivity_peak": peak}}
 
 
 def start_entry(sampler: Sampler) -> dict[str, Any]:

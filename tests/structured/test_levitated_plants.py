@@ -13,6 +13,7 @@ from scipy.linalg import solve
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.codesign.result_entries import IsoZones, iso_entry
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure import synthesise_sections as synthesise
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
@@ -164,3 +165,15 @@ def test_a_pole_too_fast_for_the_delay_is_told_before_a_search(tmp_path) -> None
         words = " ".join(found.words for found in diagnose(problem_of(load_case(path)))[1])
         assert "the stiffness drives a motion away at the start" in words
         assert ("no controller has a peak of S below 2.51" in words) is told
+
+
+def test_a_levitated_plant_has_its_zone_of_iso_14839() -> None:
+    zones = IsoZones()
+    assert [zones.of(peak) for peak in (2.99, 3.0, 3.99, 4.5, 5.0)] == ["A", "B", "B", "C", "D"]
+    case = load_case("examples/magnetic_axis/case.toml")
+    problem = problem_of(case)
+    of_set = {"sensitivity_peak": 2.0, "robust": {"worst_sensitivity_peak": 3.5}}
+    found = iso_entry(problem, problem.start, of_set)["iso_14839_3"]
+    assert found == {"zone": "B", "sensitivity_peak": 3.5}
+    guided = problem_of(load_case("runs/two_mass.toml"))
+    assert iso_entry(guided, guided.start, of_set) == {}
