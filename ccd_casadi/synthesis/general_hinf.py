@@ -23,9 +23,9 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, matrix_balance, svd
+from scipy.linalg import block_diag, svd
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -235,10 +235,8 @@ def general_synthesis(
     ------
     NoHinfController
     """
-    A, scaling = matrix_balance(P.A, permute=False, separate=True) if len(P.A) else (P.A, None)
-    scale = np.ones(0) if scaling is None else scaling[0]
+    A, B, C = balanced(P.A, P.B, P.C) if len(P.A) else (P.A, P.B, P.C)
     p1, m1 = P.D.shape[0] - nmeas, P.D.shape[1] - ncon
-    B, C = P.B / scale[:, None], P.C * scale
     D12, D21, D22 = P.D[:p1, m1:], P.D[p1:, :m1], P.D[p1:, m1:]
     require_assumptions(A, B[:, :m1], B[:, m1:], C[:p1], C[p1:], D12, D21, options)
     U, s, Vt = svd(D12)
@@ -258,6 +256,8 @@ def general_synthesis(
         if isinstance(made, str):
             continue
         K = _with_feedthrough(made, D22)
+        if len(K.A):
+            K = StateSpace(*balanced(K.A, K.B, K.C), K.D)
         CL = lower_transformation(P, K, nmeas, ncon)
         slowest = float(np.linalg.eigvals(CL.A).real.max(initial=-np.inf))
         norm, rounding = largest_on_grid(P, K, CL)
