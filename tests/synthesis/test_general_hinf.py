@@ -175,7 +175,7 @@ def test_what_is_no_problem_is_refused() -> None:
 def test_what_others_reported_is_solved_or_refused_by_name(source: str) -> None:
     """Published levels are met; a plant that breaks an assumption is solved with a little noise."""
     hard = HARD[source]
-    grid = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 500)])
+    grid, refused = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 500)]), []
     for size in (0.0, 1e-6, 1e-4, 1e-2):
         given = regularised(hard.plant, size) if size else hard.plant
         whole = given.whole()
@@ -183,9 +183,7 @@ def test_what_others_reported_is_solved_or_refused_by_name(source: str) -> None:
             found = hinfsyn(ct.ss(whole.A, whole.B, whole.C, whole.D), len(given.C2),
                             given.B2.shape[1])  # fmt: skip
         except NoHinfController as error:
-            assert hard.irregular
-            lost = error.reason is HinfFailure.NOT_CERTIFIED
-            assert lost == bool(size), error
+            refused.append(error.reason)
             continue
         K = StateSpace(found.K.A, found.K.B, found.K.C, found.K.D)
         loop = close(hard.plant, K)
@@ -194,5 +192,9 @@ def test_what_others_reported_is_solved_or_refused_by_name(source: str) -> None:
         break
     else:
         pytest.fail("no size of noise was enough")
+    assert hard.irregular == bool(refused)
+    if refused:
+        assert refused[0] is not HinfFailure.NOT_CERTIFIED  # an assumption, by name
+        assert set(refused[1:]) <= {HinfFailure.NOT_CERTIFIED}
     if hard.gamma is not None:
         assert found.certificate.gamma_opt == pytest.approx(hard.gamma, abs=hard.digits)
