@@ -52,6 +52,8 @@ class LoopFigureOptions:
         Relative.
     ringing : float
         Damping of a root of the loop within an octave of ω_b: 2 % are left after 12 periods.
+    reach : float
+        Factor to both sides of a range of frequencies, within which a resonance of the plant is.
     around : int
         Points within an octave of ω_b, on both sides: 0.7 % apart.
     """
@@ -68,6 +70,7 @@ class LoopFigureOptions:
     light: float = 0.1 * (1.0 - 1e-6)
     near: float = 0.2
     ringing: float = 0.05
+    reach: float = 1.25
     around: int = 201
 
     @property
@@ -298,14 +301,15 @@ class SecondCrossover:
 
 
 def second_crossover(
-    omega: Array, L: np.ndarray, plant: Array, crossover: float
-) -> SecondCrossover | None:
-    """Find where the controller alone takes |L| above 1 again beyond the crossover.
+    omega: Array, L: np.ndarray, plant: Array, crossover: float, light: Array,
+    options: LoopFigureOptions = LoopFigureOptions(),
+) -> SecondCrossover | None:  # fmt: skip
+    """Find where the controller takes |L| above 1 again beyond the crossover.
 
-    A resonance of the plant that takes |L| above 1 raises |G| between the edge and the peak of
-    such a range, and is common practice where its phase is known. Where |G| falls on that way the
-    controller raises |L|: stability then rests on the plant's gain and phase at frequencies that
-    the bandwidth does not need, and for which the model is rarely made.
+    A resonance of the plant that takes |L| above 1 is common practice where its phase is known. In
+    such a range |G| has its largest value inside, not at an end. Elsewhere, or beside a lightly
+    damped pole of K, the controller raises |L|: stability then rests on the plant's gain and phase
+    at frequencies that the bandwidth does not need, and for which the model is rarely made.
 
     Parameters
     ----------
@@ -317,6 +321,9 @@ def second_crossover(
         |G| there: of that actuator over all outputs, or of that sensor over all actuators.
     crossover : float
         In rad/s, as `ClassicalMargins` has it.
+    light : array
+        Frequencies in rad/s of lightly damped poles of K.
+    options : LoopFigureOptions
 
     Returns
     -------
@@ -332,21 +339,34 @@ def second_crossover(
     returns = [(a, b) for a, b in zip(first, end, strict=True) if omega[a - 1] > crossover]
     found = []
     for a, b in returns:
-        top = a + int(size[a:b].argmax())
-        if plant[top] <= plant[a - 1]:
-            found.append(SecondCrossover(float(omega[a]), float(omega[b - 1]), float(size[top])))
+        low, high = omega[a], omega[b - 1]
+        own = ((light > low * (1.0 - options.near)) & (light < high * (1.0 + options.near))).any()
+        around = (omega >= low / options.reach) & (omega <= high * options.reach)
+        top = plant[around].argmax()
+        resonance = 0 < top < np.count_nonzero(around) - 1
+        if own or not resonance:
+            found.append(SecondCrossover(float(low), float(high), float(size[a:b].max())))
     return max(found, key=lambda one: one.peak, default=None)
 
 
-def _second_crossover_of(loop: Loop) -> SecondCrossover | None:
+def light_poles(
+    controller: StateSpace, options: LoopFigureOptions = LoopFigureOptions()
+) -> Array:  # fmt: skip
+    """Frequencies in rad/s of the poles of K with less damping than `light`."""
+    w, damping = frequency_and_damping(controller.poles)
+    return np.asarray(w[np.abs(damping) < options.light])
+
+
+def _second_crossover_of(loop: Loop, options: LoopFigureOptions) -> SecondCrossover | None:
     """The largest of the loops that are cut one at a time at the plant's inputs."""
-    omega = loop.grid()
+    omega, light = loop.grid(), light_poles(loop.controller, options)
     G, K = loop.responses(omega)
     found = []
     for i in range(G.shape[2]):
         L = equivalent_open_loop(K @ G, i)
         at = classical_margins(partial(_cut, loop, i), omega).crossover
-        found.append(second_crossover(omega, L, np.linalg.norm(G[:, :, i], axis=1), at))
+        sizes = np.linalg.norm(G[:, :, i], axis=1)
+        found.append(second_crossover(omega, L, sizes, at, light, options))
     return _largest(found)
 
 
@@ -396,7 +416,8 @@ def loop_warnings(
     if again is not None:
         words.append(
             f"|L| exceeds 1 again from {again.low / HZ:.4g} to {again.high / HZ:.4g} Hz, by "
-            f"{again.peak:.3g} at most: the controller raises it where the plant has no resonance"
+            f"{again.peak:.3g} at most: the controller raises it, by a light pole of its own or "
+            "where the plant has no resonance"
         )
     return words
 
@@ -433,7 +454,8 @@ def measured_entry(
             return np.exp(np.interp(np.log(w), x, ln_L))
 
         margins.append(classical_margins(response, omega))
-        again.append(second_crossover(omega, L, plant, margins[-1].crossover))
+        at = margins[-1].crossover
+        again.append(second_crossover(omega, L, plant, at, light_poles(controller), options))
         S = np.abs(1.0 / (1.0 + response(bandwidth * options.above)))
         growth = max(growth, float((S / S[0]).max()))
         sizes.append(np.abs(1.0 / (1.0 + response(bandwidth * options.places))))
@@ -503,7 +525,7 @@ def loop_entry(
     poles = np.concatenate([loop.poles for loop in loops])
     rings = ringing(poles, bandwidth, options.ringing)
     dip = bandwidth_dip(loops, bandwidth, options)
-    again = _largest([_second_crossover_of(loop) for loop in loops])
+    again = _largest([_second_crossover_of(loop, options) for loop in loops])
     warnings = loop_warnings(growth, dip, controller, bandwidth, rings, again, options)
     least = replace(least_of(margins), crossover=margins[0].crossover)
     return _entry(least, sensitivity_peak) | {

@@ -188,6 +188,16 @@ one_or_more = _good(
     lambda value: bool(several(value)) and all(POSITIVE(v) is None for v in several(value)),
     "give a number above 0, or a list of them",
 )
+corners_hz = _good(
+    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
+    lambda value: one_or_more(value) is None and all(1e-2 <= v <= 1e7 for v in several(value)),
+    "give Hz from 0.01 to 1e7, or a list of them; leave out what is faster",
+)
+damping_ratios = _good(
+    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
+    lambda value: one_or_more(value) is None and all(1e-3 <= v <= 100.0 for v in several(value)),
+    "give a damping ratio from 0.001 to 100, or a list of them",
+)
 _pair = every(POSITIVE, "", 2, 2)
 interval = _good(
     _pair.schema,

@@ -57,7 +57,8 @@ _OF_H_INFINITY = {
 def idle_keys(data: Mapping[str, Any]) -> list[str]:
     """Required keys that have no effect on the kind of inner problem which a case's tables name."""
     given = data.get("controller")
-    if not isinstance(given, Mapping) or given.get("structure") != "sections":
+    of_weights = (None, "h_infinity", WITH_DISTURBANCE)  # of another word itself is said first
+    if not isinstance(given, Mapping) or given.get("structure") in of_weights:
         return []
     unweighted = given.get("weighted_level") is None
     tables = {"weights": WeightsTable, "inner": InnerTable}

@@ -8,7 +8,7 @@ from typing import Any
 from ccd_casadi.analysis.motor_cycle import Motion, Motor
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.cases import checks
-from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
+from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, corners_hz, damping_ratios, key, one_or_more
 from ccd_casadi.lti.wiring import Filters
 
 Numbers = float | tuple[float, ...] | None
@@ -240,11 +240,11 @@ class FiltersTable:
     """[actuator] before the forces, [sensor] behind the sensors: low passes, one or one of each
     channel."""
 
-    lag_hz: Numbers = key("corner of first order, of static gain 1", None, check=one_or_more)
+    lag_hz: Numbers = key("corner of first order, of static gain 1", None, check=corners_hz)
     second_order_hz: Numbers = key(
-        "natural frequency of second order, of static gain 1", None, check=one_or_more
+        "natural frequency of second order, of static gain 1", None, check=corners_hz
     )
-    damping: Numbers = key("damping ratio of second_order_hz", 0.7, check=one_or_more)
+    damping: Numbers = key("damping ratio of second_order_hz", 0.7, check=damping_ratios)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import ModalPlant
@@ -149,7 +150,7 @@ def unit_findings(
     """Warnings about M_K, the resonances and S_max, from the plant at the start."""
     words = [
         *_effort(problem, facts, plant, options),
-        *_resonances(problem, facts, options),
+        *(_resonances(problem, facts, options) if _states_effort(problem) else []),
         *peak_words(problem.inner.S_max, options=options),
     ]
     return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
@@ -178,9 +179,16 @@ def loop_findings(
             )
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if (run := problem.sampling) is not None:
-        words += _lag_words(run, facts.effort_hz, options)
+        meant = facts.effort_hz if _states_effort(problem) else np.nan
+        words += _lag_words(run, meant, options)
         words += _unstable_words(run, growth, problem.inner.S_max)
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
+
+
+def _states_effort(problem: CoDesignProblem) -> bool:
+    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours."""
+    kind = kind_of(problem)
+    return not kind.as_designed or kind.bounds().weighted_level is not None
 
 
 def _lag_words(run: Sampling, meant: float, options: FindingOptions) -> list[str]:

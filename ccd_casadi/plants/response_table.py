@@ -154,6 +154,9 @@ def _understood(
         if len(G) == len(hz) == G.shape[-1]:
             raise UserError(f"{path}: lines may be the first or the last index of G; drop a line")
         if len(G) != len(hz):  # lines last, as MATLAB has them
+            if G.shape[-1] != len(hz):
+                words = f"G is {G.shape}, and there are {len(hz)} frequencies"
+                raise UserError(f"{path}: {words}; give G (lines, outputs, inputs)")
             G = np.moveaxis(G, -1, 0)
             spread = spread if spread is None else np.moveaxis(spread, -1, 0)
     kept = hz != 0.0

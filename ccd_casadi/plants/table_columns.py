@@ -83,6 +83,10 @@ def refuse_polynomials(path: Path, names: Iterable[str]) -> None:
 def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColumn]:
     """Those that hold numbers, with the units that texts state; other texts are notes."""
     refuse_polynomials(path, content)
+    if {"m", "k"} <= {name.casefold() for name in content}:
+        words = "M and K are the matrices of a model, not a response"
+        raise UserError(f"{path}: {words}; give A, B, C, D in a .mat file, or a case of its own "
+                        "(ccd new)")  # fmt: skip
     found = []
     for name, value in content.items():
         numbers = np.asarray(value.toarray() if scipy.sparse.issparse(value) else value)

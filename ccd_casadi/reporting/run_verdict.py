@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from ccd_casadi.analysis.loop_figures import LoopFigureOptions
-from ccd_casadi.codesign.verdict import OwnSet, State
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictRow
 from ccd_casadi.drawing.paint import block_html, page_html, write_page
 from ccd_casadi.reporting.facts import conclusion, run_name
@@ -26,6 +26,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "optimal": "more starts or box_points in [outer]",
     "predicted": "retrain, or more points in [sampling]",
     "survives": "a [robust] set in the case",
+    "wider": "a wider resonance_shift or damping in [robust]",
     "deployable": "a higher rate or less delay",
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which goes on from what is stored",
@@ -192,12 +193,13 @@ def advice(result: Mapping[str, Any]) -> str:
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
     own = result["verdict"].get("survives", {}).get("set")
     unclosed = states.get("survives") == State.WARNED and own == OwnSet.UNPROVEN
-    if states.get("survives") == State.WARNED and not unclosed:
+    doubts = _doubts_of_kept_set(result) if own == OwnSet.KEPT else []
+    if states.get("survives") == State.WARNED and not unclosed and not doubts:
         words = "Do not build this: it does not survive small errors of its model."
         if own == OwnSet.NONE:
             words = "Do not build this yet: it was judged on the model alone."
-        return f"{words} Next: {NEXT['survives']}."
-    warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else []
+        return f"{words} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
+    warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else doubts
     warned += [
         f"{name} warned"
         for name, state in states.items()
@@ -223,6 +225,23 @@ def advice(result: Mapping[str, Any]) -> str:
     return (
         "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
     )
+
+
+def _doubts_of_kept_set(result: Mapping[str, Any]) -> list[str]:
+    """Why `survives` warns of a loop that keeps its [robust] set and small errors beyond it; empty
+    where it does not survive the latter."""
+    line = result["verdict"]["survives"]
+    shift, least = line.get("stable_shift"), line.get("least_shift", 0.0)
+    if shift is None or not (shift[0] <= -least and shift[1] >= least):
+        return []
+    damping, least_factors = line.get("stable_damping"), VerdictOptions().least_factors
+    if line.get("closer_models") or damping is None:
+        return []
+    if not (damping[0] <= least_factors[0] and damping[1] >= least_factors[1]):
+        return []
+    poles = line.get("unstable_controller_poles_hz") or []
+    at = ", ".join(f"{hz:.4g}" for hz in poles[:3])
+    return [f"the controller is unstable by itself (poles at {at} Hz)"] if poles else []
 
 
 def loop_concerns(

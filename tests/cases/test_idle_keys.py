@@ -63,3 +63,10 @@ def test_they_are_required_where_they_have_an_effect(
     del full_order["controller"], full_order["loop"], full_order["inner"]["shape"]
     with pytest.raises(CaseError, match=f"{named}: is missing"):
         parse_case(full_order, PATH)
+
+
+def test_a_structure_that_is_not_known_is_said_before_what_it_would_require() -> None:
+    misspelt = bare()
+    misspelt["controller"]["structure"] = "section"
+    with pytest.raises(CaseError, match=r"controller.structure: is 'section'; choose one of"):
+        parse_case(misspelt, PATH)

@@ -218,6 +218,9 @@ def test_robust_co_design_of_case_study_1(two_mass_run: Path, tmp_path: Path) ->
     peaks = [f.sensitivity_peak for f in figures]
     assert max(peaks) == pytest.approx(result["robust"]["worst_sensitivity_peak"], rel=1e-6)
     assert max(peaks) <= 1.75 * (1.0 + 1e-6)
+    (required,) = (one for one in result["requirements"] if one["name"] == "S_max")
+    assert required["achieved"] == pytest.approx(max(peaks), rel=1e-6)  # of the set
+    assert required["evidence"] == "searched"
     assert run.figures.sensitivity_peak == pytest.approx(
         result["robust"]["nominal_sensitivity_peak"], rel=1e-9
     )

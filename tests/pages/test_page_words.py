@@ -105,6 +105,22 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     assert "a surrogate without it misses ω_b by 2.2 %" in conclusion(result)
 
 
+def test_a_kept_set_with_an_unstable_controller_is_a_question_and_no_refusal() -> None:
+    """What the case has is not what comes next; where small errors matter it is a wider set."""
+    kept = result_of(survives="warned")
+    kept["verdict"]["survives"] |= {
+        "set": "kept", "stable_shift": [-0.05, 0.5], "least_shift": 0.02,
+        "stable_damping": [0.1, 10.0], "unstable_controller_poles_hz": [74.3],
+    }  # fmt: skip
+    words = advice(kept)
+    assert words.startswith("Build this only if you accept: the controller is unstable by itself")
+    assert "74.3 Hz" in words
+    kept["verdict"]["survives"]["stable_shift"] = [-0.01, 0.5]
+    words = advice(kept)
+    assert words.startswith("Do not build this: it does not survive small errors")
+    assert words.endswith("a wider resonance_shift or damping in [robust].")
+
+
 def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended = result_of(optimal="unknown") | {"time_budget": {"minutes": 5.0, "ended": True}}
     words = advice(ended)

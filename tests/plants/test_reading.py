@@ -468,3 +468,18 @@ def test_a_unit_in_a_comment_is_used_and_a_gain_announced(tmp_path: Path) -> Non
     (tmp_path / "x.csv").write_text(head.replace("re,im", "re (m/N),im (m/N)") + rows)
     with pytest.raises(UserError, match=r"line 1, unit: gives .* keep one"):
         read_frequency_response(tmp_path / "x.csv")
+
+
+def test_sizes_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "two.npz"
+    hz = np.geomspace(1.0, 100.0, 95)
+    np.savez(path, f_hz=hz, G=np.ones((100, 2, 2)) * (1.0 + 1j))
+    with pytest.raises(UserError, match=r"G is \(100, 2, 2\), and there are 95 frequencies"):
+        read_plant(path, 0.0, lambda words: None)
+
+
+def test_matrices_of_a_model_are_no_response(tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    np.savez(path, M=np.eye(2), D=np.eye(2), K=np.eye(2), B=np.ones((2, 1)), C=np.ones((1, 2)))
+    with pytest.raises(UserError, match="M and K are the matrices of a model"):
+        read_plant(path, 0.0, lambda words: None)

@@ -14,6 +14,7 @@ from ccd_casadi.analysis.loop_figures import (
     loop_entry,
     measured_entry,
     ringing,
+    second_crossover,
     step_figures,
 )
 from ccd_casadi.analysis.move import simulate
@@ -287,3 +288,21 @@ def test_lines_warn_of_the_second_crossover_of_the_model() -> None:
         plant, controller = (x[:, 0, 0] for x in Loop(G, K).responses(omega))
         entry = measured_entry([(omega, plant * controller, np.abs(plant))], K, w / 2.0, 1.5)
         assert sum("exceeds 1 again" in x for x in entry["loop_warnings"]) == count
+
+
+def test_a_light_pole_of_the_controller_is_not_excused_by_a_rising_plant() -> None:
+    """Between an antiresonance and a resonance |G| rises; a resonance's far flank falls."""
+    omega = np.geomspace(1.0, 1e3, 4001)
+    s = 1j * omega
+    plant = (s**2 + 0.8 * s + 80.0**2) / (s**2 * (s**2 + 1.5 * s + 160.0**2))
+    lead = 300.0**2 / 80.0**2 * 160.0**2 / 3.0 * (3.0 * s / 30.0 + 1.0) / (s / 300.0 + 1.0) / 100.0
+    band = 0.01 * 100.0 * s / (s**2 + 0.01 * 100.0 * s + 100.0**2)
+    L, sizes = plant * lead, np.abs(plant)
+    none, light = np.zeros(0), np.array([100.0])
+    (crossover,) = omega[:-1][np.diff(np.sign(np.abs(L) - 1.0)) < 0.0][:1]
+    above = np.abs(L) * (omega > 1.01 * crossover) > 1.0
+    assert above.any()  # by the resonance of the plant, which is no concern
+    assert second_crossover(omega, L, sizes, float(crossover), none) is None
+    found = second_crossover(omega, L * (1.0 - 2e3 * band), sizes, float(crossover), light)
+    assert found is not None
+    assert found.low < 100.0 < found.high

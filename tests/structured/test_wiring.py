@@ -146,7 +146,9 @@ omega_low_hz = 1.0
     [
         ("[actuator]\nlag_hz = [100.0, 200.0]", "actuator.lag_hz has 2 entries for 1 channels"),
         ("[sensor]\ndamping = 0.5", "sensor.damping: has no effect without second_order_hz"),
-        ("[sensor]\nlag_hz = 0.0", "sensor.lag_hz: is 0.0; give a number above 0"),
+        ("[sensor]\nlag_hz = 0.0", "sensor.lag_hz: is 0.0; give Hz from 0.01 to 1e7"),
+        ("[sensor]\nlag_hz = 1e12", "sensor.lag_hz: is 1000000000000.0; give Hz from 0.01 to 1e7"),
+        ("[sensor]\nsecond_order_hz = 1e3\ndamping = 1e9", "give a damping ratio from 0.001"),
         ('[actuator]\nlag_hz = 100.0\n[budget.force]\nlevel = 1.0\nunit = "N"', "budget"),
     ],
 )
