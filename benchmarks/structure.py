@@ -62,7 +62,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.synthesis.closed_loop": ("EPS",),
     "ccd_casadi.synthesis.matlab_systems": ("SECONDS",),
     "ccd_casadi.support.text": ("HZ",),
-    "ccd_casadi.support.guard": ("DIES_WITH_PARENT",),
+    "ccd_casadi.support.command_line": ("DIES_WITH_PARENT",),
     "surrogates.covariance": ("ROOT5", "NO_NOISE"),
     "surrogates.gaussian_process": ("TWO_SIDED_95",),
 }  # fmt: skip

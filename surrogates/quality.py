@@ -44,11 +44,6 @@ class Extrapolation:
     deviation: float | None
     reasons: tuple[str, ...]
 
-    @property
-    def flagged(self) -> bool:
-        """Whether the surrogate extrapolates at the point."""
-        return bool(self.reasons)
-
 
 def extrapolation(
     surrogate: GaussianProcess,

@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.analysis.motor_cycle import MotionAt, MotionOptions
+from ccd_casadi.analysis.motor import MotionAt, MotionOptions
 from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling, sampled, tustin

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ccd_casadi.analysis.motor_cycle import Motion, Motor
+from ccd_casadi.analysis.motor import Motion, Motor
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, corners_hz, damping_ratios, key, one_or_more

@@ -1,28 +1,49 @@
-"""The final judgement of a design on the plants as written, by our judge and by SLICOT."""
+"""The final judgement of a design: on plants as written, along its robust set, on closer models.
 
-from collections.abc import Sequence
-from dataclasses import replace
-from itertools import zip_longest
+A resonance shift keeps the damping ratio of a plant whose damping is given by ratios, and the
+matrix of one whose damping is a matrix: there a mode's ratio grows as its frequency falls. Which of
+the two a stage keeps is not known.
+
+Closer models are a finer mesh, or more modes (spill-over). Nothing is designed anew: the controller
+is measured on each reference of the plant, and has to certify there at the γ that it was certified
+at, or is reported as not robust to it. The plants as written are judged by our judge and by SLICOT.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product, zip_longest
 from math import inf
+from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign, certify
+from ccd_casadi.codesign.survival import PEAK, LoopsOffModel, Survival, excess_of, highest, survival
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, require_as_returned
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    free_modal,
+    plant_of,
+    require_as_returned,
+)
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
-from ccd_casadi.plants.modal import NOMINAL
-from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.modal import NOMINAL, Perturbation
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.terminal import Progress
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.second_engine import (
     NOT_COMPARED,
     EngineComparison,
     compared,
     second_opinion,
 )
-from ccd_casadi.synthesis.synthesis import Design
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 
 
 def written_plants(
@@ -102,3 +123,231 @@ def second_on_set(
          {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)})
         for plant, figures in pairs
     )  # fmt: skip
+
+
+KEPT = {
+    "ratio": "a resonance shift keeps every mode's damping ratio",
+    "matrix": "a resonance shift leaves the damping matrix alone: ratios grow as resonances fall",
+}
+
+
+@dataclass(frozen=True)
+class RobustCheckOptions:
+    """Numbers of the check of a robust set.
+
+    Attributes
+    ----------
+    shifts : int
+        Of the set at which the design is checked, at the least.
+    exceeded : float
+        Of a bound: what the other damping has to exceed it by to be reported.
+    """
+
+    shifts: int = 41
+    exceeded: float = 0.01
+
+
+@dataclass(frozen=True)
+class RobustCheck:
+    """The worst of the plants of a design's set that were checked: ‖S‖∞ there, infinite where
+    the loop is unstable; `nominal` on the model."""
+
+    nominal: float
+    peak: float
+    at: Perturbation
+    plants: int
+    passed: bool
+
+    @property
+    def words(self) -> str:
+        """Whether the set is kept, and where it is worst."""
+        at = f"at {100 * self.at.shift:+.2g} %, damping x {self.at.damping:.3g}"
+        if self.peak == inf:
+            return f"unstable within the [robust] set, {at}"
+        peak = f"peak of S {self.peak:.4g} {at}"
+        if self.passed:
+            return f"the [robust] set is kept ({self.plants} plants, worst {peak})"
+        return f"the [robust] set is not kept: {peak}"
+
+
+@dataclass(frozen=True)
+class OtherDamping:
+    """Figures over bounds on the set's extreme plants, with the damping that it keeps ("ratio" or
+    "matrix") and with the other; none where the loop is unstable on one of them."""
+
+    kept: str
+    own: Mapping[str, float]
+    other: Mapping[str, float]
+
+    @property
+    def words(self) -> str:
+        """What passes a bound by more than a hundredth with the other damping only, or nothing."""
+        other = "matrix" if self.kept == "ratio" else "ratio"
+        where = f"on the set if the damping {other} is kept and not the {self.kept}"
+        if not self.own:
+            return ""
+        if not self.other:
+            return f"a loop is unstable {where}"
+        found = [
+            f"{'S' if name == 'S_max' else name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
+            for name, share in self.other.items()
+            if share - max(1.0, self.own[name]) > RobustCheckOptions().exceeded
+        ]
+        return f"{', '.join(found)} {where}" if found else ""
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of result.json's `robust`."""
+        return {
+            "damping_kept": self.kept,
+            "damping_words": "; ".join(part for part in (KEPT[self.kept], self.words) if part),
+            "figures_over_bounds_other_damping": self.other,
+        }
+
+
+def survived(
+    problem: CoDesignProblem, loops: LoopsOffModel, design: DesignFigures | SectionsDesign
+) -> tuple[Survival | None, RobustCheck | None]:
+    """What a certified loop survives and whether its set is kept, without contradicting each other.
+
+    The ranges are evaluated at the ends of the set and where it is worst too, and the set at all
+    places of the ranges.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With S_max and the set.
+    loops : LoopsOffModel
+        Of the design's controller.
+    design : DesignFigures or SectionsDesign
+        The design as its certificate has it.
+
+    Returns
+    -------
+    survival : Survival or None
+        None where the design is not certified.
+    check : RobustCheck or None
+        None where mixed sensitivity has no set.
+    """
+    check = check_robust(problem, loops)
+    if not design.certified:
+        return None, check
+    marks = [abs(end) for end in kind_of(problem).common_shifts()]
+    if check is not None and check.at.damping == 1.0:
+        marks.append(abs(check.at.shift))
+    inner, slack = problem.inner, kind_of(problem).slack
+    peak = getattr(design, "sensitivity_peak", np.nan)
+    if isinstance(design, SectionsDesign) and design.certificate is not None:
+        peak = max(plant.S_peak for plant in design.certificate.plants)
+    # What the first engine finds above S_max fails its own line; only the second is judged here.
+    slack = float(np.fmax(1.0, peak / inner.S_max)) * (1.0 + slack) - 1.0
+    found = survival(
+        loops, S_max=inner.S_max, bandwidth=design.bandwidth, omega_low=inner.omega_low,
+        slack=slack, marks=marks, held=kind_of(problem).common_shifts(),
+    )  # fmt: skip
+    return found, check_robust(problem, loops)
+
+
+def check_robust(problem: CoDesignProblem, loops: LoopsOffModel) -> RobustCheck | None:
+    """The loop all along a mixed-sensitivity design's set; None where it has none."""
+    if problem.robust is None:
+        return None
+    robust, level = problem.robust, problem.inner.S_max * (1.0 + PEAK)
+    factors = sorted({1.0, *robust.damping})
+    places = _places(loops, robust.shift, robust.shifts)
+    for factor in factors:
+
+        def excess(shift: float, factor: float = factor) -> float:
+            return excess_of(loops.at(Perturbation(shift, factor)), level)
+
+        values = [excess(place) for place in places]
+        for i in range(len(places) - 2):
+            highest(excess, places[i : i + 3], values[i : i + 3])
+    seen = {
+        off: loop.peak if loop.stable else inf
+        for off, loop in loops.known.items()
+        if abs(off.shift) <= robust.shift and off.damping in factors
+    }
+    at = max(seen, key=lambda off: seen[off])
+    model = loops.at(Perturbation())
+    return RobustCheck(
+        model.peak if model.stable else inf, seen[at], at, len(seen), seen[at] <= level
+    )
+
+
+def _places(loops: LoopsOffModel, reach: float, shifts: int) -> list[float]:
+    """From end to end of a set, its own shifts among them."""
+    places = [-reach]
+    while places[-1] < reach:
+        step = min(loops.step(places[-1]), 2.0 * reach / (RobustCheckOptions().shifts - 1))
+        places.append(min(places[-1] + step, reach))
+    return sorted({*places, *np.linspace(-reach, reach, shifts).tolist(), 0.0})
+
+
+def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDamping | None:
+    """None where the set shifts no resonance."""
+    kind = kind_of(problem)
+    low, high = kind.common_shifts()
+    if not high > low:
+        return None
+    factors, gains = kind.other_factors()
+    bounds = kind.bounds()
+    places = [Perturbation(s, d) for s, d in product((low, high), sorted({1.0, *factors}))]
+
+    def judged(of: LoopsOffModel) -> SetCertificate:
+        plants = []
+        for place, gain in product(places, sorted(set(gains))):
+            modal = of.modal(place)
+            modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
+            plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
+        return certify(plants, of.controller, bounds, of.sampling)
+
+    kept = "matrix" if loops.given else "ratio"
+    return OtherDamping(kept, judged(loops).worst, judged(loops.other).worst)
+
+
+@dataclass(frozen=True)
+class ReferenceCheck:
+    """One reference: whether the design is certified there again, why not, and its figures."""
+
+    name: str
+    outcome: Outcome
+    figures: DesignFigures
+
+    @property
+    def certified(self) -> bool:
+        """Certified on the reference at the design's own γ."""
+        return self.outcome is Outcome.CERTIFIED
+
+
+def check_references(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    design: Design,
+    workers: Pool | None = None,
+    quiet: bool = True,
+) -> tuple[ReferenceCheck, ...]:
+    """The design's controller on every reference of the problem's plant at θ."""
+    names = tuple(plant_of(problem).references)
+    tasks = {name: (problem, tuple(theta), design, name) for name in names}
+    bar = Progress(len(tasks), "closer models", quiet=quiet)
+    checks = dict(bar.over(results(workers, _check, tasks)))
+    return tuple(checks[name] for name in names)
+
+
+def _check(
+    problem: CoDesignProblem, theta: tuple[float, ...], design: Design, name: str
+) -> ReferenceCheck:
+    return check_on(problem, plant_of(problem).references[name](theta), design, name)
+
+
+def check_on(
+    problem: CoDesignProblem, system: Mechanics, design: Design, name: str
+) -> ReferenceCheck:
+    """The design's controller on one plant, given by its matrices."""
+    closer = scale_plant(free_modal(problem, system), problem.weights.M_K)
+    at = partial(measure, closer, design.controller, design.weights,
+                 omega_low=problem.inner.omega_low)  # fmt: skip
+    figures = at(gamma=design.figures.certificate.norm_bound)
+    outcome = figures.outcome
+    return ReferenceCheck(name, outcome, figures if figures.certified else at())

@@ -11,14 +11,18 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.final_judgement import second_on_weighted
+from ccd_casadi.codesign.final_judgement import (
+    check_references,
+    other_damping,
+    second_on_weighted,
+    survived,
+)
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
-from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign

@@ -17,11 +17,9 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.final_judgement import second_on_set
-from ccd_casadi.codesign.outer import Place, PolishedDesign, is_expensive
-from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
+from ccd_casadi.codesign.final_judgement import other_damping, second_on_set, survived
+from ccd_casadi.codesign.outer import Place, PolishedDesign, ThetaOuter, is_expensive, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
-from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.stored_searches import (
     multistart_at,
     printer,

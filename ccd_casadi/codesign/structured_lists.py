@@ -16,6 +16,7 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.outer import ThetaDescentOptions, pieces_from
 from ccd_casadi.codesign.outer_problem import (
     NonlinearProgram,
     OuterFailure,
@@ -23,7 +24,6 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.outer_theta import ThetaDescentOptions, pieces_from
 from ccd_casadi.codesign.stored_searches import printer
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution

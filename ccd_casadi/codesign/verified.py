@@ -13,10 +13,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.final_judgement import judge_on_model
+from ccd_casadi.codesign.final_judgement import OtherDamping, judge_on_model
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
 from ccd_casadi.codesign.result_entries import controller_dict
-from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import VerdictLine, VerdictOptions, search_evidence, survives
 from ccd_casadi.fixed_structure.judgement import Judgement

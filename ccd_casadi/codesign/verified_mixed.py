@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
 
+from ccd_casadi.codesign.final_judgement import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.result_entries import mixed_dict
-from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding

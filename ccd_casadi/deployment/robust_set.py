@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.final_judgement import written_plants
-from ccd_casadi.codesign.robust_check import RobustCheckOptions
+from ccd_casadi.codesign.final_judgement import RobustCheckOptions, written_plants
 from ccd_casadi.deployment.realisation import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice

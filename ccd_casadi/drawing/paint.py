@@ -15,9 +15,8 @@ from markupsafe import Markup
 from markupsafe import escape as escaped
 
 from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.charts import figure_landscape, panel_html
 from ccd_casadi.drawing.content import Drawing, Landscape, Lines, Page, Panel, Table
-from ccd_casadi.drawing.lines import panel_html
-from ccd_casadi.drawing.maps import figure_landscape
 from ccd_casadi.drawing.surface import data, legend, still
 from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME, axis_label
 from ccd_casadi.support.arrays import Array

@@ -16,7 +16,15 @@ from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.paint import escape
-from ccd_casadi.explorer.controls import Controls, PlacesFigure, moves
+from ccd_casadi.explorer.controls import (
+    Controls,
+    MapFigure,
+    PlacesFigure,
+    landscape_of,
+    moves,
+    run_surrogate,
+    steepest_axes,
+)
 from ccd_casadi.explorer.curves import (
     EMPTY,
     FIGURES,
@@ -31,13 +39,11 @@ from ccd_casadi.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.explorer.designs import How, Knobs, Look
+from ccd_casadi.explorer.designs import Designed, How, Knobs, Look, anchored, designed
 from ccd_casadi.explorer.known_plant import Background, Solve
-from ccd_casadi.explorer.map_figure import MapFigure, landscape_of, run_surrogate, steepest_axes
 from ccd_casadi.explorer.painter import ON_DARK, Message, PanelFigure, cursor, legend_html
 from ccd_casadi.explorer.pins import Kept, Pins
 from ccd_casadi.explorer.session import Session, searched_exactly
-from ccd_casadi.explorer.structured import Designed, anchored, designed
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -16,10 +16,10 @@ from bokeh.models import CustomJS
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
+from ccd_casadi.drawing.charts import positive_range
 from ccd_casadi.drawing.content import Curve, Panel
 from ccd_casadi.drawing.labels import LINE as TALL
 from ccd_casadi.drawing.labels import SIZE, Labels
-from ccd_casadi.drawing.lines import positive_range
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, THEME, VARIABLES
 from ccd_casadi.support.text import package_text
 

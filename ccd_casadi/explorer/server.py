@@ -20,11 +20,11 @@ from tornado.web import StaticFileHandler
 
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.explorer.curves import FIGURES
+from ccd_casadi.explorer.designs import designed
 from ccd_casadi.explorer.known_plant import Background
 from ccd_casadi.explorer.page import SOLVED, ExplorerPage
 from ccd_casadi.explorer.pins import Kept
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.structured import designed
 
 HOST = "127.0.0.1"
 TEMPLATE = Path(__file__).with_name("page.html")

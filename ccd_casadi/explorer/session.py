@@ -13,20 +13,22 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.explorer.curves import surface_modes_html
 from ccd_casadi.explorer.designs import (
+    Designed,
     Elements,
     How,
     Knobs,
     Look,
     Problems,
+    anchored,
     case_at,
     elements_at,
+    judged_look,
     knobs_of,
     present,
     searched,
     without_controller,
 )
 from ccd_casadi.explorer.known_plant import KnownPlant
-from ccd_casadi.explorer.structured import Designed, anchored, judged_look
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import lumped

@@ -34,13 +34,14 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     peaks,
     with_crossings,
 )
-from ccd_casadi.fixed_structure.certificate_loops import (
+from ccd_casadi.fixed_structure.certificate_responses import (
+    LoopResponses,
     as_run,
     balanced_system,
     error_response,
+    norms,
     sampled,
 )
-from ccd_casadi.fixed_structure.certificate_responses import LoopResponses, norms
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, weighted

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
-from ccd_casadi.fixed_structure.certificate_loops import as_run, holds
+from ccd_casadi.fixed_structure.certificate_responses import as_run, holds
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse

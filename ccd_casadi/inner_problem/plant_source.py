@@ -12,8 +12,7 @@ from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.analysis.driven_plant import with_motion
-from ccd_casadi.analysis.motor_cycle import Motion
+from ccd_casadi.analysis.motor import Motion, with_motion
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed, with_wiring

@@ -6,8 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.analysis.driven_plant import DrivenMechanics
-from ccd_casadi.analysis.motor_cycle import MotionAt
+from ccd_casadi.analysis.motor import DrivenMechanics, MotionAt
 from ccd_casadi.analysis.move import Move, simulate
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.analysis.yield_bound import Yield

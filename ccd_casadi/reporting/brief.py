@@ -19,7 +19,7 @@ from markupsafe import Markup
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.lines import panel_html
+from ccd_casadi.drawing.charts import panel_html
 from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of

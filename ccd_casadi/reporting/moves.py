@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.motor_cycle import Motor, cycle_of
+from ccd_casadi.analysis.motor import Motor, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint

@@ -19,11 +19,13 @@ from ccd_casadi.robust.margins import (
     DiskMargin,
     Margins,
     Noise,
+    StructuredBound,
     gains,
     highest,
     margins,
     noise,
     norms,
+    structured_bound,
 )
 from ccd_casadi.robust.perturbed import (
     Line,
@@ -35,7 +37,6 @@ from ccd_casadi.robust.perturbed import (
     tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.structured_singular_value import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import kept_quiet

@@ -30,20 +30,18 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.general_certificate import (
-    HinfCertificate,
-    is_below,
-    largest_on_grid,
-    lower_transformation,
-    spectral_norm,
-)
 from ccd_casadi.synthesis.general_levels import (
     GeneralPlant,
+    HinfCertificate,
     HinfFailure,
     HinfOptions,
     NoHinfController,
     central_controller,
+    is_below,
+    largest_on_grid,
     least_level,
+    lower_transformation,
+    spectral_norm,
 )
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles.helpers import problem
 
-from ccd_casadi.codesign.robust_check import OtherDamping, survived
+from ccd_casadi.codesign.final_judgement import OtherDamping, survived
 from ccd_casadi.codesign.survival import (
     PEAK,
     LoopsOffModel,

@@ -18,13 +18,13 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
+from ccd_casadi.codesign.final_judgement import survived
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.result_entries import kept_words, robust_dict
-from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign

@@ -18,7 +18,7 @@ from ccd_casadi.codesign import outer as outer_room
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.nested import Nested
-from ccd_casadi.codesign.outer_theta import ThetaOuter
+from ccd_casadi.codesign.outer import ThetaOuter
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.run import OUTERS, solve
 from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence

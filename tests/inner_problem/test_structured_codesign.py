@@ -14,7 +14,7 @@ from ccd_casadi.codesign import stored_searches
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
-from ccd_casadi.codesign.outer_theta import pieces_from
+from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
 from ccd_casadi.inner_problem import structured_bandwidth

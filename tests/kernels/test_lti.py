@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccd_casadi.fixed_structure.certificate_loops import sampled as judged
+from ccd_casadi.fixed_structure.certificate_responses import sampled as judged
 from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, refine_peak, root_flanks
 from ccd_casadi.lti.loop import Loop, Sampling, at_instants, in_w, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, responses_of

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import eigh, expm
 
-from ccd_casadi.analysis.motor_cycle import Motion, MotionAt, Motor, motion_at
+from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime

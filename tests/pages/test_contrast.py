@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from ccd_casadi.drawing.maps import GROUND, RING
+from ccd_casadi.drawing.charts import GROUND, RING
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.drawing.svg import COLOUR_MAP, THEME
 from ccd_casadi.support.text import package_text

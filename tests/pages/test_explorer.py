@@ -11,6 +11,7 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
+from ccd_casadi.explorer.controls import landscape_of, steepest_axes
 from ccd_casadi.explorer.curves import (
     FIGURES,
     as_sampled,
@@ -33,7 +34,6 @@ from ccd_casadi.explorer.designs import (
     present,
 )
 from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
-from ccd_casadi.explorer.map_figure import landscape_of, steepest_axes
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop

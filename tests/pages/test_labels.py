@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccd_casadi.drawing.charts import drawn_axes
 from ccd_casadi.drawing.content import Curve, Level, Mark, Panel
 from ccd_casadi.drawing.labels import LETTER, LINE
-from ccd_casadi.drawing.lines import drawn_axes
 from ccd_casadi.drawing.svg import NARROW, WIDTH, style
 
 TIME = np.linspace(0.0, 300.0, 700)

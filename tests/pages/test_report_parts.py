@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from oracles.html_document import Document
 
+from ccd_casadi.drawing.charts import figure_landscape
 from ccd_casadi.drawing.content import (
     Chapter,
     Curve,
@@ -22,7 +23,6 @@ from ccd_casadi.drawing.content import (
     ThetaPath,
     Words,
 )
-from ccd_casadi.drawing.maps import figure_landscape
 from ccd_casadi.drawing.paint import block_html, page_html
 from ccd_casadi.report import main as report_command
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccd_casadi.robust.structured_singular_value import mu_bound
+from ccd_casadi.robust.margins import mu_bound
 
 
 def drawn(count: int, n: int, seed: int = 0) -> np.ndarray:

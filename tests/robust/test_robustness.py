@@ -20,7 +20,7 @@ from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting.robustness_page import _bandwidth_lost
-from ccd_casadi.robust.margins import gains, margins, noise
+from ccd_casadi.robust.margins import gains, margins, noise, structured_bound
 from ccd_casadi.robust.perturbed import (
     damping_line,
     shift_line,
@@ -28,7 +28,6 @@ from ccd_casadi.robust.perturbed import (
     tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.structured_singular_value import structured_bound
 from ccd_casadi.robustness import main
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import synthesise

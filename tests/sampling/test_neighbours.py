@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
-from ccd_casadi.codesign.outer_theta import pieces_from
+from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling import sampler as module

@@ -11,9 +11,8 @@ from oracles.hard_plants import HARD, close, regularised
 import ccd_casadi as ccd
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.synthesis.general_certificate import is_below
 from ccd_casadi.synthesis.general_hinf import hinfsyn, mixsyn
-from ccd_casadi.synthesis.general_levels import HinfFailure, NoHinfController
+from ccd_casadi.synthesis.general_levels import HinfFailure, NoHinfController, is_below
 
 
 @given(seed=st.integers(0, 10_000))

@@ -16,9 +16,8 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
     mass,
 )
 from ccd_casadi.case_studies.rib_stage.mesh import Mesh
-from ccd_casadi.case_studies.rib_stage.model import RibStage, discretisation, modes_at
+from ccd_casadi.case_studies.rib_stage.model import ModeCount, RibStage, discretisation, modes_at
 from ccd_casadi.case_studies.rib_stage.stage_modes import sector_of
-from ccd_casadi.case_studies.rib_stage.truncation import ModeCount
 from ccd_casadi.drawing.content import Area, Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.svg import (
     BLACK,

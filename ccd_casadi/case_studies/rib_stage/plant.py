@@ -9,9 +9,15 @@ import casadi as ca
 from ccd_casadi.case_studies.rib_stage import reduced
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
-from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, ROWS, RibStage
+from ccd_casadi.case_studies.rib_stage.model import (
+    FORTY_FOUR,
+    OUTPUTS,
+    ROWS,
+    TWENTY,
+    ModeCount,
+    RibStage,
+)
 from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
-from ccd_casadi.case_studies.rib_stage.truncation import FORTY_FOUR, TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.plants.differenced import remembered

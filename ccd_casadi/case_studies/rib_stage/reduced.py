@@ -31,9 +31,11 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
 )
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
 from ccd_casadi.case_studies.rib_stage.model import (
+    TWENTY,
     RibStage,
     assembled,
     discretisation,
+    faded,
     points_of,
     rigid_part,
 )
@@ -50,7 +52,6 @@ from ccd_casadi.case_studies.rib_stage.stage_modes import (
     sector_of,
     spectrum,
 )
-from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, faded
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side
