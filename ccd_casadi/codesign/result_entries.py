@@ -451,11 +451,11 @@ def iso_entry(
     Returns
     -------
     dict
-        `iso_14839_3` with its zone and the peak of all plants; empty of other plants.
+        `iso_14839_3` with its zone and the peak of all plants; None of other plants.
     """
     system = mechanics(plant_of(problem), theta, derivatives=False)
     if not free_modal(problem, system).driven_away.any():
-        return {}
+        return {"iso_14839_3": None}
     known = (result.get("robust") or {}).get("worst_sensitivity_peak")
     peak = max(result["sensitivity_peak"], known or 0.0)
     return {"iso_14839_3": {"zone": IsoZones().of(peak), "sensitivity_peak": peak}}

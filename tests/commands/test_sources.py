@@ -18,6 +18,7 @@ PROCESSES = {
     ("ccd_casadi/deployment/source_code.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
     ("ccd_casadi/explorer/known_plant.py", "subprocess.Popen"),
+    ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }
 BY_NAME = {
