@@ -52,7 +52,7 @@ def box(mode_hz: float | None) -> UncertainPlant:
 @cache
 def designed(mode_hz: float | None) -> SectionsDesign:
     plants = box(mode_hz).plants(box(mode_hz).corners())
-    found = synthesise(plants, Structure(biquads=1), BOUNDS, sampling=RUN, starts=1)
+    found = synthesise(plants, Structure(biquads=1), BOUNDS, sampling=RUN, starts=3)
     assert found.certified, found.outcome
     return found
 

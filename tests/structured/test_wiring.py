@@ -95,7 +95,7 @@ def test_an_amplifier_that_is_stated_is_designed_for(pole_hz: float) -> None:
     wired = replace(bare, wiring=Wiring(actuator=AMPLIFIER))
     box = UncertainPlant((wired,), 1e5, gain=0.1)
     design = synthesise_sections(box.plants(box.corners()), Structure(biquads=1), bounds,
-                                 sampling=run, starts=2)  # fmt: skip
+                                 sampling=run, starts=3)  # fmt: skip
     assert design.certified
     assert design.controller is not None
     w = 500.0 * HZ
