@@ -5,7 +5,7 @@ import ast
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.machinery import PathFinder, SourceFileLoader
@@ -76,23 +76,24 @@ def digest_of(files: tuple[Path, ...]) -> str:
 def loaded_from(files: Iterable[Path]) -> list[str]:
     """Names of modules in this process that come from these files."""
     known = set(files)
-    return [name for name, place in _own_modules() if place in known]
+    return [name for name, place in _own_modules() if place in known] if known else []
 
 
 def unseen(files: Iterable[Path], before: Iterable[str]) -> list[Path]:
     """Modules in the folder of the first file that were loaded since, and are not among these."""
     known, old = list(files), set(before)
     return [
-        place for name, place in _own_modules()
-        if name not in old and place not in known and place.is_relative_to(known[0].parent)
+        place for _, place in _own_modules(old)
+        if place not in known and place.is_relative_to(known[0].parent)
     ]  # fmt: skip
 
 
-def _own_modules() -> Iterator[tuple[str, Path]]:
+def _own_modules(but: Set[str] = frozenset()) -> Iterator[tuple[str, Path]]:
+    """The user's modules in this process; to resolve a place is dear, with thousands of them."""
     for name, module in list(sys.modules.items()):
-        origin = getattr(module, "__file__", None)
-        if name != "__main__" and isinstance(origin, str) and _own(Path(origin).resolve()):
-            yield name, Path(origin).resolve()
+        origin = None if name in but else getattr(module, "__file__", None)
+        if name != "__main__" and isinstance(origin, str) and _own(place := Path(origin).resolve()):
+            yield name, place
 
 
 def _own(place: Path) -> bool:

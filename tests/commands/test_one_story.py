@@ -22,7 +22,7 @@ SEEDS = [2, 4, *(pytest.param(seed, marks=SLOW) for seed in (1, 5, 9, 13))]
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_run_contradicts_itself_nowhere(seed: int) -> None:
-    row = consistency.judged(seed, 200.0)
+    row = consistency.judged(seed, None)  # what a process adds is that of other tests
     assert "failed" not in row
     assert row["status"] != "infeasible"  # else there is little to compare
     assert row["wrong"] == []

@@ -52,14 +52,14 @@ def compare(theta: tuple[float, float], inner: InnerBounds) -> float:
     return searched.bandwidth / swept.bandwidth - 1.0
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(200, marks=pytest.mark.slow)])
 def test_search_finds_the_optimum_of_the_sweep(count: int) -> None:
     rng = np.random.default_rng(2)
     errors = [compare(tuple(rng.uniform(55.0, 70.0, 2)), INNER) for _ in range(count)]
     assert np.abs(errors).max() < 1e-6
 
 
-@pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(100, marks=pytest.mark.slow)])
 def test_search_finds_the_optimum_under_other_constraints(count: int) -> None:
     rng = np.random.default_rng(4)
     errors = []
@@ -112,7 +112,7 @@ def check_against_dense_sweep(theta: tuple[float, float], points: int) -> float:
     "theta", [(60.0, 60.0), pytest.param((58.33, 55.0), marks=pytest.mark.slow)]
 )
 def test_optimum_is_not_below_a_dense_sweep(theta: tuple[float, float]) -> None:
-    assert check_against_dense_sweep(theta, 60) < 1e-6
+    assert check_against_dense_sweep(theta, 40) < 1e-6
 
 
 @pytest.mark.slow

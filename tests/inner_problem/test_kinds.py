@@ -75,6 +75,13 @@ class Run:
         return HZ * self.result["bandwidth_hz"] if error is None else error
 
 
+def lean(case: CoDesignProblem) -> CoDesignProblem:
+    """With one start of a search where it has several: what is kept does not depend on them."""
+    if not isinstance(case.controller, StructuredProblem):
+        return case
+    return replace(case, controller=replace(case.controller, starts=1))
+
+
 def counted(calls: Counter[str], name: str, honest: Any) -> Any:
     def call(*arguments: Any, **more: Any) -> Any:
         calls[name] += 1
@@ -166,9 +173,12 @@ def test_the_result_has_the_same_keys_and_checks(run: Run, schema: dict[str, Any
 
 def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
     """And what was stored before there was a format passes."""
+    kind = jsonschema.validators.validator_for(schema)
+    kind.check_schema(schema)
+    known = kind(schema)  # once: to check a schema costs more than to check a result
     for place in sorted((Path(__file__).parents[1] / "data/results").iterdir()):
         old = json.loads(place.read_text())
-        jsonschema.validate(old, schema)
+        known.validate(old)
         assert "format" not in old
         wrong = [old | {"format": FORMAT + 1}, old | {"syntheses": 1.5}, old | {"status": "done"}]
         wrong += [{name: old[name] for name in old if name != key} for key in schema["required"]]
@@ -178,13 +188,14 @@ def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
             wrong += [{name: old[name] for name in old if name != key} for key in of_a_design]
         for other in wrong:
             with pytest.raises(jsonschema.ValidationError):
-                jsonschema.validate(other, schema)
+                known.validate(other)
 
 
 @pytest.mark.parametrize("name", EACH)
 def test_what_is_infeasible_has_a_result_too(name: str, schema: dict[str, Any]) -> None:
-    case = KINDS[name]
-    result = solve(replace(case, inner=replace(case.inner, S_low=1e-6)), Direct(starts=1)).result
+    case = lean(KINDS[name])
+    none = replace(case, inner=replace(case.inner, S_low=1e-6))
+    result = solve(none, Direct(starts=1, box_points=2)).result
     assert (result["status"], result["format"]) == ("infeasible", FORMAT)
     jsonschema.validate(result, schema)
 
@@ -208,7 +219,7 @@ def test_an_interrupted_run_makes_no_synthesis_twice(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C once the polish is done, before the design is judged."""
-    case, made, options = KINDS[kind], Counter[str](), Direct(starts=1, box_points=2)
+    case, made, options = lean(KINDS[kind]), Counter[str](), Direct(starts=1, box_points=0)
     for where, what in SYNTHESISE:
         monkeypatch.setattr(where, what, counted(made, what, getattr(where, what)))
     whole = solve(case, options, store=tmp_path / "whole.sqlite").result

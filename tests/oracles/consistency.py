@@ -14,6 +14,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,8 +34,13 @@ from oracles.verdicts_judge import HZ, Chain, Loop
 ROOT = Path(__file__).parents[2]
 
 
-def called(command: str, *options: str, seconds: float) -> tuple[int | None, str]:
-    """Exit code (None: out of time) and what was printed."""
+def called(command: str, *options: str, seconds: float | None) -> tuple[int | None, str]:
+    """Exit code (None: out of time) and what was printed; without a limit in this process."""
+    if seconds is None:
+        out, err = StringIO(), StringIO()
+        with redirect_stdout(out), redirect_stderr(err):
+            code = import_module(f"ccd_casadi.{command}").main([*options, "--workers", "1"])
+        return code, f"{out.getvalue()}\n{err.getvalue()}"
     call = [sys.executable, "-m", f"ccd_casadi.{command}", *options, "--workers", "1"]
     try:
         done = subprocess.run(call, capture_output=True, text=True, timeout=seconds)
@@ -58,7 +66,9 @@ def two_channels(folder: Path, seed: int) -> Path:
     return path
 
 
-def tuned(folder: Path, chain: Chain, case: dict[str, Any], seed: int, seconds: float) -> Any:
+def tuned(
+    folder: Path, chain: Chain, case: dict[str, Any], seed: int, seconds: float | None
+) -> Any:
     """By lines of a chain's response, or by its matrices."""
     rate = 40.0 * case["inner"]["omega_T_hz"][0]
     A, B, C = (np.atleast_2d(part) for part in chain.at(1.0, 1.0)[:3])
@@ -82,7 +92,7 @@ def tuned(folder: Path, chain: Chain, case: dict[str, Any], seed: int, seconds: 
     return {"status": status, "wrong": tuned_disagreements(out, text)}
 
 
-def judged(seed: int, seconds: float) -> dict[str, Any]:
+def judged(seed: int, seconds: float | None) -> dict[str, Any]:
     """The row of a seed."""
     kind, formulation, chain, case = drawn(seed)
     kind = {5: "two channels", 7: "tune", 8: "tune"}.get(seed % 10, kind)

@@ -5,7 +5,7 @@ by Tustin's difference equation.
 """
 
 import numpy as np
-from scipy.linalg import expm, solve
+from scipy.linalg import expm
 
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.lti.state_space import StateSpace
@@ -36,6 +36,7 @@ def sampled_loop(
     loop[n + late :, :n], loop[n + late :, n + late :] = -b @ C, a
     omega = np.geomspace(1e-5, 1.0, points) * np.pi / T
     z = np.exp(1j * omega * T)
-    G = np.array([(C @ solve(x * np.eye(n) - Ad, Bd + 0j))[0, 0] / x**late for x in z])
-    R = np.array([(c @ solve(x * np.eye(m) - a, b + 0j) + d)[0, 0] for x in z])
+    x = z[:, None, None]
+    G = (C @ np.linalg.solve(x * np.eye(n) - Ad, Bd + 0j))[:, 0, 0] / z**late
+    R = (c @ np.linalg.solve(x * np.eye(m) - a, b + 0j) + d)[:, 0, 0]
     return float(np.abs(np.linalg.eigvals(loop)).max()), omega, np.abs(1.0 / (1.0 + G * R))

@@ -257,7 +257,9 @@ def test_more_delay_never_gives_more() -> None:
     assert reached[0] * 1.01 >= reached[1] >= reached[2] * 0.99
 
 
-@pytest.mark.parametrize("seed", [7, 12, 28])
+@pytest.mark.parametrize(
+    "seed", [28, *(pytest.param(other, marks=pytest.mark.slow) for other in (7, 12))]
+)
 def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
     """Random chains, of which a study had sixty."""
     asked, made = random_sections.climbed(random_sections.case(seed), seed)
@@ -273,7 +275,7 @@ def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
     assert all(made.bandwidth <= upper_bound(pair) < np.inf for pair in shifted)
 
 
-@pytest.mark.parametrize("seed", [0, 8])
+@pytest.mark.parametrize("seed", [0, pytest.param(8, marks=pytest.mark.slow)])
 def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     """What the design has of |S|, |KS| and |T| as bounds, without a shape."""
     problem = chain_problem(seed)

@@ -43,7 +43,14 @@ def judged(plant: object, K: object, rate: float, delay: int = 0) -> float:
     S = control.feedback(1, held * k)
     if np.abs(S.poles()).max() >= 1.0:
         return float(np.inf)
-    return float(np.abs(S(np.exp(1j * np.linspace(1e-4, np.pi, 20000)))).max())
+    return float(np.abs(response_at(S, np.linspace(1e-4, np.pi, 20000))).max())
+
+
+def response_at(S: control.StateSpace, angle: np.ndarray) -> np.ndarray:
+    """C (z - A)⁻¹ B + D at z = exp(j·angle), by dense solves: python-control loops over points."""
+    z = np.exp(1j * angle)[:, None, None]
+    found = S.C @ np.linalg.solve(z * np.eye(len(S.A)) - S.A, S.B.astype(complex)) + S.D
+    return found[:, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -58,7 +65,7 @@ def judged(plant: object, K: object, rate: float, delay: int = 0) -> float:
 )
 def test_models_are_tuned_and_judged_apart(plant: object, rate: float, delay: int) -> None:
     """Integrating, unstable, resonant and non-minimum-phase ones, by other libraries alone."""
-    found = ccd.tune(plant, rate_hz=rate, delay=delay / rate, starts=6)
+    found = ccd.tune(plant, rate_hz=rate, delay=delay / rate, starts=4)
     assert found.design.usable, found.design.words
     for one, norm in zip(plant if isinstance(plant, list) else [plant], found.norms, strict=True):
         S = judged(one, found.controller, rate, delay)
@@ -236,7 +243,7 @@ def test_the_command_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[
     """A response without low lines; and a file that is none."""
     one = two_by_two(1.0)
     high = MeasuredResponse(one.hz[one.hz > 24.0], one.G[one.hz > 24.0, 0, 0])
-    code = main([written(tmp_path / "a.npz", high), "--rate", "1000", "--quiet"])
+    code = main([written(tmp_path / "a.npz", high), "--rate", "1000", "--quiet", "--workers", "1"])
     said = capsys.readouterr().err
     assert code in (3, 4)
     assert "a.npz: " in said
@@ -247,7 +254,7 @@ def test_the_command_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_rotary_plant_is_shown_in_its_own_units(tmp_path: Path) -> None:
     model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [50.0]], "C": [[1.0, 0.0]], "D": [[0.0]]}
     savemat(tmp_path / "axis.mat", model)
-    words = [str(tmp_path / "axis.mat"), "--rate-hz", "2000", "--biquads", "0", "--quiet"]
+    words = [str(tmp_path / "axis.mat"), "--rate-hz", "2000", "--biquads", "0", "--quiet", "--workers", "1"]
     assert main([*words, "--out", str(tmp_path), "--rotary"]) == 0
     page = (tmp_path / "report.html").read_text()
     assert "N m/rad" in page

@@ -22,6 +22,7 @@ from oracles.helpers import (
     scaled,
     sensitivity_gain,
     stack_gain,
+    state_response,
     to_control,
     two_mass,
     two_mass_model,
@@ -35,7 +36,7 @@ from ccd_casadi.synthesis.synthesis import Design, Outcome, sweep, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 LIMITED = (6, 22, 23, 30, 34, 47, 56)  # seeds of flexible_case that γ_jω limits
-FLEXIBLE = (*LIMITED[:3], *range(10, 14))
+FLEXIBLE = (*LIMITED[:2], 10, 11)  # sixty of them in the slow run
 LEVEL = 1.0 / np.sqrt(2.0)
 
 
@@ -182,7 +183,7 @@ def check_flexible(seed: int) -> bool:
 
 def test_flexible_plants_are_certified_and_hold_in_si() -> None:
     limited = [seed for seed in FLEXIBLE if check_flexible(seed)]
-    assert limited == sorted(LIMITED[:3])
+    assert limited == sorted(LIMITED[:2])
 
 
 @pytest.mark.slow
@@ -193,7 +194,7 @@ def test_sixty_flexible_plants_are_certified_and_hold_in_si() -> None:
 # ---- lower bound ------------------------------------------------------------------------------
 
 
-@few(max_examples=5)
+@few(max_examples=4)
 @given(st.integers(0, 10**6), st.floats(5e2, 1e4), st.floats(1e2, 1e4))
 def test_lower_bound_is_the_largest_over_frequency(seed: int, omega_S: float, omega_T: float):
     """γ_jω against the closed form on a grid of G formed in SI: never below, met somewhere."""
@@ -202,10 +203,9 @@ def test_lower_bound_is_the_largest_over_frequency(seed: int, omega_S: float, om
     w = Weights(**(vars(PAPER) | {"M_K": 1e5, "omega_S": omega_S, "omega_T": omega_T}))
     figures = synthesise(scaled(system, w.M_K), w, omega_low=OMEGA_LOW).figures
     plant = reference_plant(system)
-    system_si = control.ss(*vars(plant).values())
 
     def bound(omega: np.ndarray) -> np.ndarray:
-        G = np.linalg.svd(system_si(1j * omega).transpose(2, 0, 1))[1][:, -1]
+        G = np.linalg.svd(state_response(plant, omega))[1][:, -1]
         W1, W2, W3 = np.abs(w.responses(omega)) ** 2
         R = W2 / G**2 + W3
         return np.sqrt(W1 * R / (W1 + R))
