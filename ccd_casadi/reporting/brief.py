@@ -24,13 +24,13 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.reporting.facts import binding, conclusion, cost_words, run_name
+from ccd_casadi.reporting.facts import binding, cost_words, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
 from ccd_casadi.reporting.run_verdict import advice, lines_of, loop_concerns, unproven
 from ccd_casadi.reporting.structured_page import binding_words
-from ccd_casadi.support.text import HZ, display_unit, number, template, with_unit
+from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
 from surrogates.files import write_whole
 
 NAME = "brief.html"
@@ -132,13 +132,24 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
     machine = machines(run)
     return template("drawing/assets/brief.html", typeset=typeset).render(
         css=Markup(CSS), name=run_name(run.case.path), decision=decision, colour=colour,
-        lead=conclusion(result), rows=list(before_and_after(run, options)),
+        lead=_lead(result), rows=list(before_and_after(run, options)),
         bars=nearest(list(bars(result)), options.requirements), machine=machine, S=Markup(panel),
         L=None if machine else Markup(panel_html(locus, 2, options.height, "L", "L of the loop")),
         limits=_limits(problem, result)[: options.limits], ifs=list(what_if(result, options)),
         risks=risks(result)[: options.risks], evidence=_evidence(result),
         footer=_footer(run),
     )  # fmt: skip
+
+
+def _lead(result: Mapping[str, Any]) -> str:
+    """What was chosen and what it reaches, in words that need no other page."""
+    count = result.get("judge", {}).get("plants", 1)
+    plants = "on its model" if count == 1 else f"on every one of {counted(count, 'plant')}"
+    theta = theta_words({k: v for k, v in result.items() if k != "varies"})
+    varies = theta_words({**result, "theta": {}, "fixed": {}})
+    over = f", {varies}" if varies else ""
+    reached = f"The loop has a bandwidth of {number(result['bandwidth_hz'], 4)} Hz {plants}{over}"
+    return f"Chosen: {theta}. {reached}; the hardware costs {cost_words(result, 4)}."
 
 
 def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[BeforeAfter]:
@@ -188,7 +199,7 @@ def bars(result: Mapping[str, Any]) -> Iterator[Bar]:
         achieved, margin, hz = (one[key] for key in ("achieved", "margin", "frequency_hz"))
         where = ("" if hz is None else f"{number(hz, 4)} Hz", one["plant"])
         yield Bar(
-            one["name"], f"{one['required']:.4g}",
+            one["name"], f"{one['required']:.4g}" if one["required"] else "at most 0",
             "not known" if achieved is None else _small_as_zero(achieved, one["required"]),
             float("nan") if margin is None else 1.0 - margin,
             "not known" if margin is None else f"{_percent(margin, 1)} %",
@@ -234,7 +245,7 @@ def what_if(result: Mapping[str, Any], options: BriefOptions) -> Iterator[tuple[
         low, high = margin
         fails = not low <= 1.0 - options.gain <= 1.0 + options.gain <= high
         then = "unstable" if fails else "stable"
-        most = f"; the gain may be {number(low, 2)} to {number(high, 3)} times the model's"
+        most = f"; on the model it may be {number(low, 2)} to {number(high, 3)} times as large"
         yield f"the plant's gain is off by {100.0 * options.gain:g} %", then + most
     late, deploy = result.get("delay_margin_us"), result.get("verdict", {}).get("deployable", {})
     rate = deploy.get("rate_hz")
@@ -247,15 +258,17 @@ def what_if(result: Mapping[str, Any], options: BriefOptions) -> Iterator[tuple[
         )
 
 
-def risks(result: Mapping[str, Any], *, identified: float = 0.1) -> list[str]:
+def risks(
+    result: Mapping[str, Any], *, identified: float = 0.1, least_shift: float = 0.005
+) -> list[str]:
     """What may go wrong, the most serious first; what has no check is among them.
 
     Parameters
     ----------
     result : mapping
         Of result.json.
-    identified : float
-        Relative: resonances are known that well.
+    identified, least_shift : float
+        Relative: resonances are known that well; and below which none is known.
 
     Returns
     -------
@@ -283,8 +296,11 @@ def risks(result: Mapping[str, Any], *, identified: float = 0.1) -> list[str]:
     shift = survives.get("S_max_shift")
     if shift is not None and min(abs(end) for end in shift) < identified:
         ends = f"{_percent(shift[0], 1)} to +{_percent(shift[1], 1)} %"
-        found.append(f"|S| stays within S_max for resonances {ends} off their model: identify "
-                     "them that well.")  # fmt: skip
+        at_once = min(abs(end) for end in shift) < least_shift
+        words = f"|S| stays within S_max for resonances {ends} off their model"
+        if at_once:
+            words = "|S| exceeds S_max as soon as a resonance is off its model to one side"
+        found.insert(0 if at_once else len(found), f"{words}: identify them that well.")
     phase, gain = result.get("phase_margin_deg"), result.get("gain_margin")
     if phase is not None and gain is not None:
         margins = f"{number(phase, 3)}° of phase and a gain of {number(gain, 3)}, up or down"
@@ -303,6 +319,10 @@ def _evidence(result: Mapping[str, Any]) -> str:
     judge = result.get("judge", {})
     second = result.get("second_engine", {}).get("words", "")
     words = [f"An independent judge (NumPy, on the matrices as written): {judge.get('words', '')}"]
+    if any(one["evidence"] == "proven" for one in result.get("requirements", ())):
+        names = result.get("proof", {}).get("parameters", ())
+        over = f"the whole [robust] set ({', '.join(names)})" if names else "these plants alone"
+        words.append(f"Proven: at every frequency, for {over}")
     return ". ".join(filter(None, (*words, second))) + "."
 
 

@@ -254,8 +254,8 @@ def test_the_command_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_rotary_plant_is_shown_in_its_own_units(tmp_path: Path) -> None:
     model = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [50.0]], "C": [[1.0, 0.0]], "D": [[0.0]]}
     savemat(tmp_path / "axis.mat", model)
-    words = [str(tmp_path / "axis.mat"), "--rate-hz", "2000", "--biquads", "0", "--quiet", "--workers", "1"]
-    assert main([*words, "--out", str(tmp_path), "--rotary"]) == 0
+    words = [str(tmp_path / "axis.mat"), "--rate-hz", "2000", "--biquads", "0", "--quiet"]
+    assert main([*words, "--workers", "1", "--out", str(tmp_path), "--rotary"]) == 0
     page = (tmp_path / "report.html").read_text()
     assert "N m/rad" in page
     assert "N/m" not in page
