@@ -327,6 +327,11 @@ def _on_models(
     if over:
         i, loop = over[0]
         words = f"the closed loop with plant {i} has ‖S‖∞ = {loop.norm:.4g}; {design.words}"
+        if not np.isfinite(loop.norm):  # whatever the winding on lines of frequency says
+            words = (
+                f"the sampled loop with model {i} is not stable by its poles; more starts may find "
+                "a controller that stabilises it"
+            )
         return replace(design, usable=False, words=words)
     if not design.usable or design.figures is None:
         return design
