@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import bandwidth_dip
+from ccd_casadi.analysis.loop_warnings import bandwidth_dip
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure

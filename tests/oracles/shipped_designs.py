@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi import inner
-from ccd_casadi.analysis.loop_figures import light_roots
+from ccd_casadi.analysis.loop_warnings import light_roots
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant

@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
-from ccd_casadi.analysis.loop_figures import LoopFigureOptions, _dip, bandwidth_dip, loop_entry
+from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.analysis.loop_warnings import LoopWarningOptions, bandwidth_dip, dip_of
 from ccd_casadi.fixed_structure import ShapeEnd, Structure, certify, synthesise_sections
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.text import HZ
 
-AROUND, HALF_POWER = LoopFigureOptions().places, 2.0**-0.5
+AROUND, HALF_POWER = LoopWarningOptions().places, 2.0**-0.5
 EASY = replace(BOUNDS, S_max=2.0, compliance_max=None)
 
 
@@ -60,11 +61,11 @@ def test_the_judges_bandwidth_is_the_largest_within_the_shape(seed, sampling) ->
 @given(st.floats(0.3, 2.0), st.floats(0.02, 0.3), st.floats(0.02, 0.4))
 def test_a_dip_is_found_by_its_depth_and_a_slope_is_none(slope, depth, width) -> None:
     line = HALF_POWER * AROUND**slope
-    assert _dip([line]) == pytest.approx(1.0, abs=1e-12)
+    assert dip_of([line]) == pytest.approx(1.0, abs=1e-12)
     narrow = HALF_POWER * AROUND * (1.0 + depth * np.tanh(np.abs(np.log(AROUND)) / (0.1 * width)))
-    assert _dip([narrow]) == pytest.approx(1.0 + depth, rel=1e-2)
+    assert dip_of([narrow]) == pytest.approx(1.0 + depth, rel=1e-2)
     step = HALF_POWER * AROUND * np.where(AROUND > 1.0, 1.0 + depth, 1.0)
-    assert _dip([step]) == pytest.approx(1.0, abs=1e-12)
+    assert dip_of([step]) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.slow

@@ -10,13 +10,11 @@ from oracles.fixed_structure_loops import FAST, LATE, loop, plant
 from ccd_casadi.analysis.loop_figures import (
     LoopFigureOptions,
     largest_force_step,
-    light_roots,
     loop_entry,
     measured_entry,
-    ringing,
-    second_crossover,
     step_figures,
 )
+from ccd_casadi.analysis.loop_warnings import light_roots, ringing, second_crossover
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
