@@ -206,7 +206,9 @@ interval = _good(
 )
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
-factors = every(POSITIVE, "give a list of numbers above 0")
+factors = every(
+    number(0.01, 20.0, ""), "give factors between 0.01 and 20, such as [0.5, 2] for half to twice"
+)
 numbers = every(ANY, "give a list of numbers", 1)
 direction = _good(
     numbers.schema,

@@ -288,6 +288,8 @@ def _effort(
     if np.isfinite(effort) and low <= effort <= options.effort_margin * high:
         return []
     aim, gain = _at_a_third(problem, plant)
+    if 1.0 / options.effort_margin < gain < options.effort_margin:
+        return []  # it is not M_K that is far off
     where = (
         f"the plant's gain falls through 1/M_K at {effort:.3g} Hz"
         if np.isfinite(effort)

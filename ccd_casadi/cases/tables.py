@@ -128,7 +128,10 @@ class InnerTable:
     S_max: float = key(
         "bound of the peak of S, as a ratio: 2 is 6 dB",
         check=checks.number(
-            1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral"
+            1.0,
+            math.inf,
+            "give more than 1 and less than infinity: a peak of S below 1 contradicts Bode's "
+            "integral",
         ),
     )
     S_low: float = key("bound of |S| at omega_low", check=checks.FRACTION)

@@ -27,7 +27,7 @@ from scipy.linalg import block_diag, svd
 
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.general_levels import (
@@ -101,7 +101,9 @@ def hinfsyn(
     """
     import control as ct
 
-    system = P if isinstance(P, ct.StateSpace) else ct.ss(P)
+    system = _state_space(P, "hinfsyn: P")
+    if not all(isinstance(number, int | np.integer) for number in (nmeas, ncon)):
+        raise UserError("hinfsyn: nmeas and ncon are numbers of signals; give whole numbers")
     if system.isdtime(strict=True):
         raise UserError("hinfsyn: P is in discrete time; map it by the bilinear rule, which keeps "
                         "gains, and K back")  # fmt: skip
@@ -127,7 +129,7 @@ def mixsyn(
     g : control.StateSpace or control.TransferFunction
         The plant, from u to y.
     w1, w2, w3 : the same, or None
-        Weights of S, K S and T, of one channel or square; at least one.
+        Weights of S, K S and T, of one channel or square; at least one. A number is a gain.
     options : HinfOptions
 
     Returns
@@ -144,8 +146,9 @@ def mixsyn(
 
     if w1 is None and w2 is None and w3 is None:
         raise UserError("mixsyn: no weight is given; give w1, w2 or w3")
-    plant = g if isinstance(g, ct.StateSpace) else ct.ss(g)
-    weights = [None if w is None else ct.ss(w) for w in (w1, w2, w3)]
+    plant = _state_space(g, "mixsyn: g")
+    weights = [None if w is None else _state_space(w, f"mixsyn: w{i}")
+               for i, w in enumerate((w1, w2, w3), 1)]  # fmt: skip
     if any(each is not None and each.isdtime(strict=True) for each in (plant, *weights)):
         raise UserError("mixsyn: the plant or a weight is in discrete time; see hinfsyn")
     p, m = plant.noutputs, plant.ninputs
@@ -154,6 +157,24 @@ def mixsyn(
     P = weighted_plant(_matrices(plant), systems)
     found = hinfsyn(ct.ss(P.A, P.B, P.C, P.D), p, m, options=options)
     return MixsynDesign(found.K, found.CL, (found.gamma, found.certificate))
+
+
+def _state_space(system: Any, name: str) -> "control.StateSpace":
+    """A system as python-control has it; UserError where it is none, or is not finite."""
+    import control as ct
+
+    if isinstance(system, int | float | np.number):  # a gain
+        system = ct.ss([], [], [], [[float(system)]])
+    try:
+        made = system if isinstance(system, ct.StateSpace) else ct.ss(system)
+    except (TypeError, ValueError, NotImplementedError, ct.ControlMIMONotImplemented) as error:
+        raise UserError(
+            f"{name} is no proper system of python-control ({described(error)}); give a "
+            "StateSpace or a proper TransferFunction"
+        ) from None
+    if not all(np.isfinite(part).all() for part in (made.A, made.B, made.C, made.D)):
+        raise UserError(f"{name} has an entry that is not finite")
+    return made
 
 
 def _matrices(system: "control.StateSpace") -> StateSpace:

@@ -90,6 +90,8 @@ MISTAKES: list[tuple[str, Any, str, str]] = [
     # inner
     ("inner.S_max", 1.0, "inner.S_max", "give more than 1"),
     ("inner.S_max", 0.9, "inner.S_max", "Bode's integral"),
+    ("inner.S_max", math.inf, "inner.S_max", "less than infinity"),
+    ("robust", {"damping": [50.0, 200.0]}, "robust.damping", "such as [0.5, 2] for half to twice"),
     ("inner.S_low", 0.0, "inner.S_low", "give a number between 0 and 1"),
     ("inner.S_low", 1.0, "inner.S_low", "give a number between 0 and 1"),
     ("inner.omega_low_hz", 0.0, "inner.omega_low_hz", "give a number above 0"),

@@ -157,7 +157,17 @@ def test_an_assumption_that_does_not_hold_is_named(reason: HinfFailure) -> None:
 
 
 def test_what_is_no_problem_is_refused() -> None:
-    G = ct.ss(-1.0, 1.0, 1.0, 0.0)
+    G, s = ct.ss(-1.0, 1.0, 1.0, 0.0), ct.tf("s")
+    with pytest.raises(UserError, match="g has an entry that is not finite"):
+        mixsyn(ct.ss(np.nan, 1.0, 1.0, 0.0), 1 / (s + 1))
+    with pytest.raises(UserError, match="w1 is no proper system"):
+        mixsyn(G, s**2 / (s + 1))
+    with pytest.raises(UserError, match="w2 is no proper system"):
+        mixsyn(G, 1 / (s + 1), "2")
+    with pytest.raises(UserError, match="give whole numbers"):
+        hinfsyn(ct.ss(-BOTH, BOTH, BOTH, BOTH), 1.0, 1)
+    number, gain = mixsyn(G, 1 / (s + 1), 2.0), mixsyn(G, 1 / (s + 1), ct.tf(2, 1))
+    assert number.info[0] == gain.info[0]
     with pytest.raises(UserError, match="no weight"):
         mixsyn(G)
     with pytest.raises(UserError, match="discrete time"):
