@@ -153,7 +153,7 @@ def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield (
             one["name"], f"{one['required']:.5g}",
             "not known" if achieved is None else f"{achieved:.5g}",
-            "not known" if margin is None else f"{100.0 * margin:.2f} %",
+            "not known" if margin is None else f"{round(100.0 * margin, 2) + 0.0:.2f} %",
             ", ".join(filter(None, where)), one["evidence"],
         )  # fmt: skip
 

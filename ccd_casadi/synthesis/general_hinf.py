@@ -11,8 +11,8 @@ and z, and other units of u and y, D12 = [0; I] and D21 = [0 I]. At a level γ t
     Y = Ric(Aᵀ, Cᵀ, B1ᵀ, D•1ᵀ, R̃),  R̃ = D•1D•1ᵀ - diag(γ² I, 0),   D•1 = [D11; D21]
 
 have a controller where both exist, X >= 0, Y >= 0 and ρ(XY) < γ². γ is found by bisection. What is
-returned is judged on its closed loop alone: its poles, and that its largest gain is below γ, by the
-Hamiltonian matrix that has eigenvalues on the axis where a gain of γ is reached.
+returned is judged on its closed loop alone: its poles, its H∞ norm (`lti.norms`), and the gains of
+P and K apart.
 
 References
 ----------
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, svd
 
+from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
@@ -37,8 +38,7 @@ from ccd_casadi.synthesis.general_levels import (
     HinfOptions,
     NoHinfController,
     central_controller,
-    is_below,
-    largest_on_grid,
+    largest_apart,
     least_level,
     lower_transformation,
     spectral_norm,
@@ -167,7 +167,7 @@ def _state_space(system: Any, name: str) -> "control.StateSpace":
         system = ct.ss([], [], [], [[float(system)]])
     try:
         made = system if isinstance(system, ct.StateSpace) else ct.ss(system)
-    except (TypeError, ValueError, NotImplementedError, ct.ControlMIMONotImplemented) as error:
+    except (TypeError, ValueError, NotImplementedError) as error:
         raise UserError(
             f"{name} is no proper system of python-control ({described(error)}); give a "
             "StateSpace or a proper TransferFunction"
@@ -279,10 +279,10 @@ def general_synthesis(
             K = StateSpace(*balanced(K.A, K.B, K.C), K.D)
         CL = lower_transformation(P, K, nmeas, ncon)
         slowest = float(np.linalg.eigvals(CL.A).real.max(initial=-np.inf))
-        norm, rounding = largest_on_grid(P, K, CL)
-        bound = max(level, norm) * (1.0 + options.room) + options.guard * rounding
-        lost = bound > level * (1.0 + options.lost)  # to rounding
-        if slowest < 0.0 and not lost and is_below(CL, bound):
+        norm, _ = hinf_norm(CL)  # infinite where it is not stable
+        apart, rounding = largest_apart(P, K, CL)
+        bound = max(level, norm, apart) * (1.0 + options.room) + options.guard * rounding
+        if bound <= level * (1.0 + options.lost):  # no more than what rounding may add
             return K, CL, HinfCertificate(bound, norm, gamma, slowest, below, why)
     raise NoHinfController(
         HinfFailure.NOT_CERTIFIED,
