@@ -352,7 +352,7 @@ def _lost(
             pencil = np.hstack(
                 [A - pole * np.eye(len(A)), B / max(spectral_norm(B), 1e-300) * scale]
             )
-            if svd(pencil, compute_uv=False)[-1] <= np.sqrt(options.axis) * scale * 1e-3:
+            if svd(pencil, compute_uv=False)[-1] <= options.uncontrolled * scale:
                 return complex(pole)
     return None
 

@@ -116,8 +116,16 @@ class HinfOptions:
         has a pole at infinity, and close to it one that double precision does not resolve.
     axis : float
         Share of the size of a matrix within which an eigenvalue counts as on the axis.
+    hamiltonian_axis : float
+        The same of a Hamiltonian matrix, whose eigenvalues come closer to it near the least γ.
+    uncontrolled : float
+        Distance of [A - λ, B] from one of lower rank, over its size, below which λ is lost.
     rank : float
         Share of the largest singular value below which one is 0.
+    negative : float
+        Share of the largest eigenvalue of X or Y below minus which one is negative.
+    up, down : float
+        Factors by which the first levels go up, and down, until γ lies between two.
     largest : float
         γ over the first that is tried, above which there is no controller.
     smallest : float
@@ -135,7 +143,12 @@ class HinfOptions:
     accuracy: float = 1e-9
     above: float = 1e-4
     axis: float = 1e-10
+    hamiltonian_axis: float = 1e-13
+    uncontrolled: float = 1e-8
     rank: float = 1e-10
+    negative: float = 1e-8
+    up: float = 4.0
+    down: float = 1e-3
     largest: float = 1e12
     smallest: float = 1e-6
     tries: int = 7
@@ -207,14 +220,14 @@ def least_level(gp: GeneralPlant, options: HinfOptions = HinfOptions()) -> tuple
     why, high = "the direct terms of w to z", max(2.0 * low, 1.0)
     first = high
     while isinstance(found := riccati_pair(gp, high, options), str):
-        low, why, high = max(low, high), found, 4.0 * high
+        low, why, high = max(low, high), found, options.up * high
         if high > options.largest * first:
             raise NoHinfController(
                 HinfFailure.NO_LEVEL, f"up to γ = {high:.3g}: {why}; scale the plant"
             )
-    low, least = low or 1e-3 * high, options.smallest * high
+    low, least = low or options.down * high, options.smallest * high
     while not isinstance(found := riccati_pair(gp, low, options), str) and low > least:
-        high, low = low, low * 1e-3
+        high, low = low, options.down * low
     if not isinstance(found, str):
         return high, 0.0, "nothing: the gain may be made as small as is liked"
     why = found
@@ -283,7 +296,7 @@ def _stabilising(
     except LinAlgError:
         return "an eigenvalue on the axis"
     poles = np.linalg.eigvals(T)
-    if stable != n or np.abs(poles.real).min() <= options.axis * 1e-3 * np.abs(poles).max():
+    if stable != n or np.abs(poles.real).min() <= options.hamiltonian_axis * np.abs(poles).max():
         return "an eigenvalue on the axis"
     basis = scaling[0][:, None] * Z[:, :n]
     U, s, Vt = svd(basis[:n])
@@ -293,7 +306,7 @@ def _stabilising(
     X = 0.5 * (X + X.T)
     values = np.linalg.eigvalsh(X)
     natural = spectral_norm(C1) ** 2 / max(spectral_norm(A), 1e-300)  # what it is of one pole
-    if values[0] < -options.rank * 1e2 * max(values[-1], natural):
+    if values[0] < -options.negative * max(values[-1], natural):
         return "a solution that is not positive"
     return np.asarray(X)
 
