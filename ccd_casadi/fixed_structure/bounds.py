@@ -99,6 +99,24 @@ class ShapeEnd(StrEnum):
     CROSSING = "crossing"
 
 
+class Place(StrEnum):
+    """Where a channel's own |S| is taken.
+
+    Attributes
+    ----------
+    WHOLE
+        ‖uᵀS‖: its error, for references at every output together.
+    SENSOR
+        |uᵀS r|, u and r of this channel: the loop is broken at its sensor alone.
+    ACTUATOR
+        |wᵀ(I + KG)⁻¹w|: the loop is broken at an actuator.
+    """
+
+    WHOLE = "whole"
+    SENSOR = "sensor"
+    ACTUATOR = "actuator"
+
+
 @dataclass(frozen=True)
 class ChannelBounds:
     """The bounds of one channel besides those of the whole loop.
@@ -113,6 +131,8 @@ class ChannelBounds:
     name : str
     output, force : tuple of float (p,), (m,)
         u makes its error uᵀe of the plant's, w its force wᵀf.
+    place, reference : Place, tuple of float (p,)
+        Where |S| is taken; r of a sensor.
     S_max, bandwidth_ratio, M_K : float or None, float, float or None
         None, or a ratio of 1: no such bound. M_K in N/m.
     """
@@ -123,6 +143,8 @@ class ChannelBounds:
     S_max: float | None = None
     bandwidth_ratio: float = 1.0
     M_K: float | None = None
+    place: Place = Place.WHOLE
+    reference: tuple[float, ...] = ()
 
     @property
     def lead(self) -> float:
@@ -165,6 +187,10 @@ class Bounds:
         m/N.
     channels : tuple of ChannelBounds
         Empty, or tighter bounds for each channel, in the structure's order.
+    error : int or None
+        Where sensors share an actuator: the channel whose error r - y counts. |S| then stands for
+        S of the loop that is broken at that sensor alone, and S_max bounds it wherever the loop may
+        be broken: `channels` are every sensor's, then the actuator's (`sensors_on_one_actuator`).
     """
 
     S_max: float
@@ -176,8 +202,12 @@ class Bounds:
     compliance_max: float | None = None
     channels: tuple[ChannelBounds, ...] = ()
     shape_ends: ShapeEnd = ShapeEnd.S_MAX
+    error: int | None = None
 
     def __post_init__(self) -> None:
+        if self.error is not None and self.weighted_level is not None:
+            words = "weighted_level is of one sensor for each actuator; leave it out"
+            raise ValueError(f"{words}, |S| is bounded at every sensor and at the actuator")
         if not self.S_max > 1.0:
             raise ValueError(f"S_max is {self.S_max}; no loop with roll-off stays below 1")
         if not self.S_low > 0.0 or not self.omega_low > 0.0:

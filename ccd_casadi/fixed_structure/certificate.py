@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.bounds import (
     ChannelBounds,
     ChannelPeaks,
     LoopPeaks,
+    Place,
     key_words,
     kind_and_channel,
 )
@@ -241,7 +242,7 @@ def judged(
         grid = np.concatenate([options.rest * grid[:, :1], grid], axis=1)
     table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
                           integrator)  # fmt: skip
-    if len(free[0].C) > 1:
+    if len(free[0].C) > 1 and bounds.error is None:
         grid, values = with_crossings(table, grid, options.curves)
     else:
         values = table.at(rows, grid)
@@ -254,13 +255,18 @@ def judged(
         tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
         beyond_half_the_rate = np.where(larger, at, 0.0)
     loops = [loops[i] for i in good]
+    inputs = [_at_the_actuator(loop, G[i], held) for loop, i in zip(loops, good, strict=True)]
     for k, i in enumerate(good):
         _raised(tops, k, loops[k], G[i], held, bounds, table.period)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
-    norm, confirmed = norms(loops, table.period, *tops["S"])
+    whole = loops
+    if bounds.error is not None:
+        whole = [_entry(bounds.channels[bounds.error], loop) for loop in loops]
+    norm, confirmed = norms(whole, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
-        of_rows, certain = _rows(one, loops, table, grid, values, tops, options.curves)
+        broken = inputs if one.place is Place.ACTUATOR else loops
+        of_rows, certain = _rows(one, broken, table, grid, values, tops, options.curves)
         for k, figures in enumerate(of_rows):
             channels[k].append(figures)
             if one.bandwidth_ratio > 1.0:
@@ -302,6 +308,10 @@ def _raised(
     of_u, of_y = np.hstack([-K.D @ G.C, K.C]), np.hstack([G.C, zero])
     KS = StateSpace(loop.A, loop.B, of_u, K.D)
     T = StateSpace(loop.A, loop.B, of_y, np.zeros((p, p)))
+    if bounds.error is not None:
+        one = bounds.channels[bounds.error]
+        T, of_y = _entry(one, T), np.array([one.output]) @ of_y
+        p = 1
     systems = {"KS": KS, "T": T}
     if period is None:
         d = np.vstack([G.B, np.zeros((len(K.A), G.B.shape[1]))])
@@ -353,15 +363,33 @@ def _rows(
     if not bounds.given:
         return [ChannelFigures(bounds.name)] * len(grid), np.ones(len(grid), bool)
     curve, u = f"S of {bounds.name}", np.array([bounds.output])
-    rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
-    norm, confirmed = norms(rows, table.period, *tops[curve])
-    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output, options)
     missing = np.full(len(grid), np.nan)
+    if bounds.place is Place.WHOLE:
+        rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
+        _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output, options)
+    else:  # ω_b is of the one whose error counts
+        rows, bandwidth = [_entry(bounds, S) for S in loops], missing
+    norm, confirmed = norms(rows, table.period, *tops[curve])
     weighted = tops.get(f"weighted KS of {bounds.name}", (missing, missing))[0]
     columns = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1).tolist()
     names = ("S_peak", "S_peak_frequency", "bandwidth", "weighted_KS")
     found = [ChannelFigures(bounds.name, **dict(zip(names, row, strict=True))) for row in columns]
     return found, confirmed
+
+
+def _entry(bounds: ChannelBounds, loop: StateSpace) -> StateSpace:
+    """uᵀ S r of a sensor or wᵀ S w of an actuator, of what `loop` has of S."""
+    at_sensor = bounds.place is Place.SENSOR
+    left, right = (bounds.output, bounds.reference) if at_sensor else (bounds.force, bounds.force)
+    row, column = np.array([left]), np.array([right]).T
+    return StateSpace(loop.A, loop.B @ column, row @ loop.C, row @ loop.D @ column)
+
+
+def _at_the_actuator(loop: StateSpace, G: StateSpace, K: StateSpace) -> StateSpace:
+    """(I + KG)⁻¹, a force beside K's to their sum, in the states of S."""
+    m = G.B.shape[1]
+    B = np.vstack([G.B, np.zeros((len(K.A), m))])
+    return StateSpace(loop.A, B, np.hstack([-K.D @ G.C, K.C]), np.eye(m))
 
 
 def _size(system: StateSpace) -> float:

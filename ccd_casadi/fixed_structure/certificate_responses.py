@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import expm, matrix_balance, schur
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds, Place
 from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
@@ -161,6 +161,8 @@ class LoopResponses:
     def _curves(
         self, matrices: dict[str, np.ndarray], omega: Array, sizes: dict[str, Array] | None = None
     ) -> dict[str, Array]:
+        if self.bounds.error is not None:
+            return self._broken(matrices)
         found = sizes or {name: sigma_max(M) for name, M in matrices.items()}
         weights = self.weights(omega)
         found |= {f"weighted {name}": W * found[name] for name, W in weights.items()}
@@ -172,18 +174,36 @@ class LoopResponses:
                 found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
+    def _broken(self, matrices: dict[str, np.ndarray]) -> dict[str, Array]:
+        """Of sensors that share an actuator: S, T and GS of the one whose error counts, and S of
+        the loop that is broken at each place."""
+        own = self.bounds.channels[self.bounds.error or 0]
+        entry = entry_of(own, matrices["S"])
+        found = {"S": np.abs(entry), "KS": sigma_max(matrices["KS"]), "T": np.abs(1.0 - entry),
+                 "GS": _length(own.output, matrices["GS"])}  # fmt: skip
+        for one in self.bounds.channels:
+            at_sensor = one.place is Place.SENSOR
+            broken = matrices["S"] if at_sensor else matrices["S at the actuator"]
+            found[f"S of {one.name}"] = np.abs(entry_of(one, broken))
+        return found
+
     def sensitivity(
         self, which: np.ndarray, omega: Array, row: Sequence[float] | None = None
     ) -> Array:
         """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
         S = self._loops(which, omega)[0]
+        if self.bounds.error is not None:
+            return np.asarray(np.abs(entry_of(self.bounds.channels[self.bounds.error], S)))
         return sigma_max(S) if row is None else _length(row, S)
 
     def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
         S, g, k = self._loops(which, omega)
         free = g if self.free is None else self.free.at(which, 1j * omega)
         KS = _product(k, S)
-        return {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
+        found = {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
+        if self.bounds.error is not None:
+            found["S at the actuator"] = np.linalg.inv(np.eye(k.shape[-2]) + k @ g)
+        return found
 
     def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
@@ -217,6 +237,13 @@ def _singular(M: np.ndarray) -> Array:
     """All singular values (..., p) of matrices (..., p, m), the least first, as `sigma_max`."""
     squared = np.linalg.eigvalsh(M @ M.conj().swapaxes(-1, -2))
     return np.sqrt(np.maximum(squared, 0.0))
+
+
+def entry_of(bounds: ChannelBounds, M: np.ndarray) -> np.ndarray:
+    """uᵀ M r of a sensor, wᵀ M w of an actuator, of matrices (..., p, m)."""
+    at_sensor = bounds.place is Place.SENSOR
+    left, right = (bounds.output, bounds.reference) if at_sensor else (bounds.force, bounds.force)
+    return np.asarray(np.array(left) @ M @ np.array(right))
 
 
 def _length(row: Sequence[float], M: np.ndarray) -> Array:

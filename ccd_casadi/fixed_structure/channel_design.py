@@ -164,7 +164,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
         return _joined(search, problem, made)
     field = _stable(problem, search.inside(search.initial))
     evaluations, known = len(search.initial), len(field)
-    shared = len(structure.decoupling.outputs) < len(structure.structures)
+    shared = min(len(M) for M in structure.directions) < len(structure.structures)
     if shared and not only_initial:
         rng = np.random.default_rng(search.seed)
         field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)

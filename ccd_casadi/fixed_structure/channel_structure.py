@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import scipy
 
-from ccd_casadi.fixed_structure.bounds import ChannelBounds
+from ccd_casadi.fixed_structure.bounds import ChannelBounds, Place
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -83,8 +83,8 @@ def given_decoupling(
 ) -> Decoupling:
     """The channels that a case gives by directions, which are brought to length 1.
 
-    There may be fewer outputs than channels (several actuators on one sensor: `[[1], [1]]`). Raises
-    PlantError where directions are zero, not of one length, or do not span all outputs and inputs.
+    There may be fewer outputs than channels (several actuators on one sensor: `[[1], [1]]`), or one
+    input for all channels (several sensors on one actuator: `[[1], [1]]` again). Raises PlantError where directions are zero, not of one length, or do not span all outputs and inputs.
     """
     found = []
     for word, rows in (("outputs", outputs), ("inputs", inputs)):
@@ -96,6 +96,9 @@ def given_decoupling(
         if count > most:
             words = f"{count} {word} need a channel each, and {most} of these are given; add"
             raise PlantError(f"{words} {count - most} more, or drop {word} of the plant")
+        if count == 1 and word == "inputs" and len(outputs[0]) == most:
+            found.append(np.ones((1, most)))
+            continue
         if count < most and word == "inputs":
             words = f"{count} {word} drive as many channels, and {most} of these are given; drop"
             raise PlantError(f"{words} {most - count}, or give the plant more {word}")
@@ -136,6 +139,41 @@ def channel_bounds(
                       tuple(map(float, force[i])), **given.get(name, {}))
         for i, name in enumerate(decoupling.names)
     )  # fmt: skip
+
+
+def sensors_on_one_actuator(
+    decoupling: Decoupling, S_max: float, own: Mapping[str, float] | None = None
+) -> tuple[ChannelBounds, ...]:
+    """Make the `channels` of `Bounds` where all channels drive one actuator.
+
+        S_i = 1/(1 + L_i) = (1 + Σ_{j≠i} G_j K_j)/(1 + Σ_j G_j K_j)   broken at sensor i alone
+        S_u = 1/(1 + Σ_j G_j K_j)                                      broken at the actuator
+
+    Parameters
+    ----------
+    decoupling : Decoupling
+        V = (1 ... 1).
+    S_max : float
+        Bound at every place.
+    own : mapping
+        By name of a channel or "actuator" a lower one.
+
+    Returns
+    -------
+    tuple of ChannelBounds
+        Of every sensor, in the channels' order, then of the actuator.
+    """
+    own = own or {}
+    references = np.linalg.inv(decoupling.outputs).T  # rᵢᵀuⱼ is 1 for i = j, else 0
+    places = [
+        ChannelBounds(name, tuple(map(float, decoupling.outputs[:, i])), (1.0,),
+                      S_max=own.get(name, S_max), place=Place.SENSOR,
+                      reference=tuple(map(float, references[:, i])))
+        for i, name in enumerate(decoupling.names)
+    ]  # fmt: skip
+    last = ChannelBounds("actuator", (0.0,) * len(decoupling.outputs), (1.0,),
+                         S_max=own.get("actuator", S_max), place=Place.ACTUATOR)  # fmt: skip
+    return (*places, last)
 
 
 def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
@@ -275,6 +313,10 @@ class ChannelStructure:
     def integrator(self) -> bool:
         """Whether every channel has one."""
         return all(structure.integrator for structure in self.structures)
+
+    def integrates(self, error: int | None) -> bool:
+        """Whether S falls to zero towards 0 Hz; of the channel whose `error` counts, if one does."""
+        return self.integrator if error is None else self.structures[error].integrator
 
     def owner(self, number: int) -> int:
         """The channel whose parameters a channel has."""

@@ -193,7 +193,8 @@ class DesignSearch:
         kappa = structure.in_units(inside, P.omega_0, P.force)
         K = structure.state_space(kappa)
         return kappa, K, certify(self.plants, K, self.problem.bounds, self.sampling,
-                                 integrator=structure.integrator, workers=self.workers)  # fmt: skip
+                                 integrator=structure.integrates(self.problem.bounds.error),
+                                 workers=self.workers)  # fmt: skip
 
     def designed(
         self, point: Point, optima: tuple[BandwidthOptimum, ...], starts: int, evaluations: int

@@ -18,11 +18,11 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import Bounds, Place, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.plant_set import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.loop_point import LoopArrays
+from ccd_casadi.kernels.loop_point import AT_ACTUATOR, AT_SENSOR, COUNTED_ROW, LoopArrays
 from ccd_casadi.kernels.modes import responses
 from ccd_casadi.kernels.sections import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.lti.frequency_grid import root_flanks
@@ -178,7 +178,7 @@ class LoopProblem:
         whole, alone = found[:, : self.first], found[:, self.first :]
         whole[[LoopCurve.S_MAX, LoopCurve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
         whole[[LoopCurve.CROSSING, LoopCurve.LEVEL]] = -HALF_POWER
-        found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
+        found[Limit.LEAST] = 0.0 if self.structure.integrates(b.error) else self.low
         found[Limit.OPENS] = float(b.opens)
         if b.shape is not None:
             whole[LoopCurve.SHAPE] = np.log(b.shape) - HALF_POWER
@@ -198,16 +198,34 @@ class LoopProblem:
             if one.lead > 0.0:
                 for curve in (LoopCurve.CROSSING, LoopCurve.LEVEL, LoopCurve.SHAPE):
                     alone[curve, i] = whole[curve, 0]
+        if b.error is not None:  # |S| is that of one sensor, not a norm over sensors
+            own = [curve for curve in LoopCurve if curve != LoopCurve.S_MAX]
+            alone[own, b.error] = whole[own, 0]
+            whole[: len(LoopCurve)] = np.inf
         return found
 
     @cached_property
     def _rows(self) -> Array:
-        """uᵀ and wᵀ of the channels in the plants' coordinates, (2, channels, m)."""
-        count, into = len(self.bounds.channels), self.plants.into
-        found = np.zeros((2, count, len(into)))
+        """uᵀ and wᵀ of the channels in the plants' coordinates, and r, (3, channels, m or p)."""
+        channels, into = self.bounds.channels, self.plants.into
+        count, width = len(channels), max(len(into), self.first)
+        found = np.zeros((3, count, width))
+        if self.bounds.error is not None:
+            found[0, :-1, : self.first] = self.plants.out
+            found[1, :, 0] = 1.0
+            for i, one in enumerate(channels[:-1]):
+                found[2, i, : self.first] = one.reference
+            found[2, -1, 0] = 1.0
+            return found
         found[0, :, : self.first] = self.plants.out[:count]
-        found[1] = np.linalg.inv(into)[:count]
+        found[1, :, : len(into)] = np.linalg.inv(into)[:count]
         return found
+
+    @cached_property
+    def _kinds(self) -> np.ndarray:
+        """Kinds of the channels' own gains, as the kernels have them."""
+        kinds = {Place.WHOLE: COUNTED_ROW, Place.SENSOR: AT_SENSOR, Place.ACTUATOR: AT_ACTUATOR}
+        return np.array([kinds[one.place] for one in self.bounds.channels], np.int64)
 
     def plants_of(self, constraints: "Constraints") -> np.ndarray:
         """The number of the plant that each row is of: several rows of a plant are numbered on."""
@@ -247,7 +265,7 @@ class LoopProblem:
         plants = self.plants
         factors, channel = self._factors
         return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,
-                          limits, self._rows)  # fmt: skip
+                          limits, self._rows, self._kinds)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ with sampling only: then the loop has finitely many poles, and its stability is 
 
 u = -K y with K = V diag(K_i) Uᵀ; where U and V are orthogonal the plants are turned into the
 coordinates of the channels first. There may be more inputs than outputs: two actuators on one
-sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2. One channel has U = V = 1.
+sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2; and more outputs on one input: two sensors on
+one actuator are U = I, V = (1 1). One channel has U = V = 1.
 
 Free bodies stay free: their poles are exactly 0, of a body that nothing damps twice, q̇ = s v and
 v̇ = b u. Such a pair of states is one of N, A = V diag(poles) W + N, N² = 0. Behind an actuator the
@@ -101,7 +102,7 @@ class LoopPlant:
 
 @dataclass(frozen=True)
 class PlantSet:
-    """All plants, p x m with p <= m, in the units of the first: ω₀ in rad/s, force in N/m; T and τ
+    """All plants, p x m with p <= m or m = 1, in the units of the first: ω₀ in rad/s, force in N/m; T and τ
     in 1/ω₀.
 
     `poles` (P, n) and `residues` (P, n, p, m) are those of the continuous plants, the shorter ones
@@ -261,7 +262,8 @@ def plant_set(
         if shape != (out.shape[1], len(into)):
             given = f"the channels' directions have {out.shape[1]} and {len(into)} entries"
             raise PlantError(f"{words}, but {given}; give as many of each")
-        if shape[0] > min(shape[1], len(out)):
+        one_actuator = len(into) == 1 and shape[0] == len(out)
+        if shape[0] > min(shape[1], len(out)) and not one_actuator:
             given = f"for {len(out)} channels"
             raise PlantError(f"{words} {given}; leave some outputs out, or give more channels")
     if decoupling is not None and decoupling.orthogonal:

@@ -129,6 +129,10 @@ class Structure:
         shift = dict(zip(ParameterKind, (np.log(gain), np.log(frequency), 0.0), strict=True))
         return kappa + np.array([shift[kind] for kind in self.kinds])
 
+    def integrates(self, error: int | None) -> bool:
+        """Whether S falls to zero towards 0 Hz."""
+        return self.integrator
+
     @property
     def structures(self) -> "tuple[Structure, ...]":
         """Those of its channels: itself."""

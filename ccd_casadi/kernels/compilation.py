@@ -88,7 +88,7 @@ def _compile_rows(curvature: bool) -> None:
     one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
     plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
     controller = (np.zeros((1, 4), np.int64), one, first, square, square)
-    limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((2, 0, 1)))
+    limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((3, 0, 1)), first[:0])
     loop = loop_point.LoopArrays(*controller, *plants, *limits)
     if curvature:
         modes.responses(plants, first, one)

@@ -6,6 +6,8 @@ import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.loop_point import (
+    AT_ACTUATOR,
+    COUNTED_ROW,
     FREE,
     GV,
     LEFT,
@@ -18,6 +20,7 @@ from ccd_casadi.kernels.loop_point import (
     M,
     S,
     V,
+    broken,
     closed,
     gain_of,
     room,
@@ -201,12 +204,12 @@ def second(curve, number, which, v, loop):
     array (M, n, n)
     """
     at, of, g, sigma = room(loop)
-    factors, values, channel, into, out, terms, residues, T, delay, _, own = loop
+    factors, values, channel, into, out, terms, residues, T, delay, _, own, kinds = loop
     (m, c), p, n = into.shape, out.shape[1], g.size
     z = np.complex128
     bends, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
     crossed, moved = np.empty((c, c), z), np.empty((c, c), z)
-    back, ahead = np.empty((m, c), z), np.empty((m, c), z)
+    back, ahead = np.empty((max(m, p), c), z), np.empty((max(m, p), c), z)
     for j in range(v.size):
         gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
         ω, chain = warped(T, v[j])
@@ -214,9 +217,13 @@ def second(curve, number, which, v, loop):
         if curve[j] == LoopCurve.GS:
             response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
-        σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
+        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
+        kind = broken(curve[j], kinds[number[j] - p]) if number[j] >= p else COUNTED_ROW
         columns = m if curve[j] == LoopCurve.GS else p
-        _by_channel(curve[j], number[j], place, into, p, own, at, of, crossed, moved, back, ahead)
+        if kind != COUNTED_ROW:  # one entry of S has no other singular value
+            columns = 1
+        _by_channel(curve[j], number[j], kind, place, into, p, own, at, of, crossed, moved, back,
+                    ahead)  # fmt: skip
         second_slopes(factors, g, bend)
         for a in range(n):
             i = channel[a]
@@ -247,14 +254,17 @@ def _over_gap(σ, other):
 
 
 @inlined
-def _by_channel(curve, number, place, into, p, own, at, of, crossed, moved, back, ahead):
+def _by_channel(curve, number, kind, place, into, p, own, at, of, crossed, moved, back, ahead):
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
-    m, c = into.shape
-    rows, columns = m if curve == LoopCurve.KS else p, m if curve == LoopCurve.GS else p
+    (m, c), at_actuator = into.shape, kind == AT_ACTUATOR
+    of_force = curve == LoopCurve.KS or at_actuator
+    rows, columns = m if of_force else p, m if curve == LoopCurve.GS else p
+    columns = 1 if kind != COUNTED_ROW else columns
     z = np.complex128
-    R, P, Q = np.zeros((c, c), z), np.zeros((m, c), z), np.zeros((m, c), z)
+    w = max(m, p)
+    R, P, Q = np.zeros((c, c), z), np.zeros((w, c), z), np.zeros((w, c), z)
     for i in range(c):
         for h in range(c):
             for a in range(p):
@@ -263,10 +273,12 @@ def _by_channel(curve, number, place, into, p, own, at, of, crossed, moved, back
     sign = 1.0 if curve == LoopCurve.T else -1.0
     for i in range(c):
         for a in range(rows):
-            if curve == LoopCurve.KS:
+            if of_force:
                 P[a, i] = into[a, i]
                 for h in range(c):
                     P[a, i] -= into[a, h] * of[K, h] * R[h, i]
+                if at_actuator:
+                    P[a, i] = -P[a, i]
             else:
                 for b in range(p):
                     P[a, i] += sign * at[S, a, b] * at[GV, b, i]
@@ -279,7 +291,7 @@ def _by_channel(curve, number, place, into, p, own, at, of, crossed, moved, back
                         entry += at[FREE, b, d] * at[V, d, q]
                 Q[q, i] += at[US, i, b] * entry
     if number >= p:
-        row_of(own[int(curve == LoopCurve.KS), number - p], P, rows, c)
+        row_of(own[int(of_force), number - p], P, rows, c)
         rows = 1
     for i in range(c):
         for h in range(c):

@@ -12,6 +12,7 @@ from ccd_casadi.kernels.sections import LoopCurve, gains, gains_and_slopes, inve
 # What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (9, w)
 G, DG, FREE, DFREE, GV, GK, S, US, M, V = range(10)  # GV = G V, US = Uᵀ S
 K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y = range(9)  # K_i, ∂ln K_i/∂ln v; U = ũ, W = v or G₀ v
+COUNTED_ROW, AT_SENSOR, AT_ACTUATOR = range(3)  # kinds of a channel's own gain, see `LoopArrays`
 
 
 class LoopArrays(NamedTuple):
@@ -29,8 +30,12 @@ class LoopArrays(NamedTuple):
         The plants (`modes.Plants`).
     limits : array
         Rows of `sections.LoopCurve` and `sections.Limit`.
-    rows : array (2, channels, m)
-        Rows of T and KS that channels bound for themselves, in the plants' coordinates.
+    rows : array (3, channels, m)
+        Rows uᵀ of S and wᵀ of KS that channels bound for themselves, and directions r of a
+        reference, in the plants' coordinates.
+    kinds : int array (channels,)
+        Of these: COUNTED_ROW ‖uᵀS‖; where the loop is broken in one place alone AT_SENSOR |uᵀS r|
+        and AT_ACTUATOR |wᵀ(I + KG)⁻¹w|.
     """
 
     factors: Any
@@ -44,6 +49,7 @@ class LoopArrays(NamedTuple):
     delay: Any
     limits: Any
     rows: Any
+    kinds: Any
 
 
 @compiled
@@ -131,43 +137,91 @@ def row_of(row, M, rows, columns):
 
 
 @compiled
-def gain_of(curve, number, into, out, own, at, of, sigma):
+def broken(curve, kind):
+    """Kind of a gain: where the loop is broken it is of S alone, other curves count rows."""
+    of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
+    return kind if of_s else COUNTED_ROW
+
+
+@compiled
+def own_gain(curve, i, into, out, k, own, kinds, at):
+    """Gain of channel i's own; its row is in M's first row, of one place its entry."""
+    (m, c), p, kind = into.shape, out.shape[1], broken(curve, kinds[i])
+    if kind == AT_ACTUATOR:  # (I + KG)⁻¹ = I - K S G, K = V diag(K_i) Uᵀ
+        for a in range(m):
+            for b in range(m):
+                total = 1.0 + 0.0j if a == b else 0.0j
+                for h in range(c):
+                    inner = 0.0j
+                    for d in range(p):
+                        inner += at[US, h, d] * at[G, d, b]
+                    total -= into[a, h] * k[h] * inner
+                at[M, a, b] = total
+        rows, columns = m, m
+    else:
+        rows, columns = matrix(curve, into, out, k, at)
+    length = row_of(own[int(curve == LoopCurve.KS or kind == AT_ACTUATOR), i], at[M], rows, columns)
+    if kind == COUNTED_ROW:
+        return length
+    entry = 0.0j
+    for b in range(columns):
+        entry += at[M, 0, b] * own[2, i, b]
+    at[M, 0, 0] = entry
+    return abs(entry)
+
+
+@compiled
+def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
     (m, c), p = into.shape, out.shape[1]
-    rows, columns = matrix(curve, into, out, of[K], at)
-    place = number
-    if number >= p:
-        row, place = own[int(curve == LoopCurve.KS), number - p], 0
-        row_of(row, at[M], rows, columns)
-    singular(at[M], rows if number < p else 1, columns, at[V], sigma, True)
+    kind, place = COUNTED_ROW, number
+    columns = m if curve == LoopCurve.GS else p
+    rows = m if curve == LoopCurve.KS else p
+    if number < p:
+        matrix(curve, into, out, of[K], at)
+        singular(at[M], rows, columns, at[V], sigma, True)
+    else:
+        place, kind = 0, broken(curve, kinds[number - p])
+        size = own_gain(curve, number - p, into, out, of[K], own, kinds, at)
+        if kind == COUNTED_ROW:
+            singular(at[M], 1, columns, at[V], sigma, True)
+        else:
+            columns = rows = m if kind == AT_ACTUATOR else p
+            sigma[0] = size
+            for b in range(columns):
+                at[V, b, 0] = own[2, number - p, b]
+    at_actuator = kind == AT_ACTUATOR
     scale = 1.0 / (sigma[place] * sigma[place])
     for a in range(rows):
         if number < p:
             of[U, a] = at[M, a, place].conjugate() * scale
         else:
-            of[U, a] = (
-                own[int(curve == LoopCurve.KS), number - p, a] * at[M, 0, 0].conjugate() * scale
-            )
+            row = own[int(curve == LoopCurve.KS or at_actuator), number - p, a]
+            of[U, a] = row * at[M, 0, 0].conjugate() * scale
     for a in range(p):
-        total = at[V, a, place]
+        total = 0.0j
         if curve == LoopCurve.GS:
-            total = 0.0j
             for b in range(m):
                 total += at[FREE, a, b] * at[V, b, place]
+        elif at_actuator:
+            for b in range(m):
+                total += at[G, a, b] * at[V, b, 0]
+        else:
+            total = at[V, a, place]
         of[W, a] = total
     for i in range(c):
         total = 0.0j
         for b in range(p):
             total += at[US, i, b] * of[W, b]
         of[RIGHT, i], total = total, 0.0j
-        if curve == LoopCurve.KS:
+        if curve == LoopCurve.KS or at_actuator:
             for a in range(m):
                 total += of[U, a] * into[a, i]
         of[LEFT, i] = total  # so far ũᵀV
     sign = 1.0 if curve == LoopCurve.T else -1.0
     for b in range(p):
         total = 0.0j
-        if curve == LoopCurve.KS:
+        if curve == LoopCurve.KS or at_actuator:
             for i in range(c):
                 total -= of[LEFT, i] * of[K, i] * at[US, i, b]
         else:
@@ -178,12 +232,14 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
         total = of[LEFT, i]
         for a in range(p):
             total += of[X, a] * at[GV, a, i]
+        if at_actuator:  # d(I + KG)⁻¹ = -(I + KG)⁻¹ dK S G, of KS it is (I + KG)⁻¹ dK S
+            total = -total
         of[LEFT, i], of[SHARE, i] = total, total * of[K, i] * of[RIGHT, i]
     for a in range(m):
         total = 0.0j
         for i in range(c):
             total += into[a, i] * of[K, i] * of[RIGHT, i]
-        of[Y, a] = total
+        of[Y, a] = at[V, a, 0] - total if at_actuator else total
     return sigma[place], place
 
 
@@ -260,9 +316,7 @@ def levels(curves, which, v, loop, least, answers):
                     known = known or of_s
                 for number in range(p, numbers):
                     if limits[curve, number] < np.inf:
-                        matrix(curve, into, outputs, k, at)
-                        row = own[int(curve == LoopCurve.KS), number - p]
-                        size = row_of(row, matrix_room, rows, columns)
+                        size = own_gain(curve, number - p, into, outputs, k, own, loop.kinds, at)
                         level = offset(curve, number, ω, chain, limits)[0]
                         out[i, j, c, number] = np.log(size) + level
     return out
@@ -291,7 +345,7 @@ def rows(curve, number, which, v, loop):
     """
     at, of, g, sigma = room(loop)
     # Unpacked once: to hand all of them to a function costs as much as a row.
-    factors, values, channel, into, out, terms, residues, T, delay, limits, own = loop
+    factors, values, channel, into, out, terms, residues, T, delay, limits, own, kinds = loop
     count, (m, c), p = v.size, into.shape, out.shape[1]
     value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
     x, sides = np.empty((count, p), np.complex128), np.zeros((2, count, m), np.complex128)
@@ -304,7 +358,7 @@ def rows(curve, number, which, v, loop):
             closed(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
             response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
-        σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
+        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
         level, rise = offset(curve[j], number[j], ω, chain, limits)
         for i in range(c):
             rise += (of[SHARE, i] * of[RATE, i]).real
