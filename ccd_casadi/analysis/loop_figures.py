@@ -21,7 +21,7 @@ from ccd_casadi.analysis.loop_warnings import (
     second_crossover,
     second_crossover_of,
 )
-from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
+from ccd_casadi.lti.loop import BreakPoint, Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
@@ -242,6 +242,8 @@ def measured_entry(
         SI.
     bandwidth, sensitivity_peak : float
         ω_b in rad/s, and ‖S‖∞.
+    places : tuple of BreakPoint
+        Of several sensors on one actuator; margins are the least of all places.
     options : LoopFigureOptions
         Of steps and warnings.
 
@@ -301,6 +303,7 @@ def loop_entry(
     sampling: Sampling | None,
     bandwidth: float,
     sensitivity_peak: float,
+    places: tuple[BreakPoint, ...] = (),
     options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:
     """Margins, steps and warnings of a stable loop under the keys of result.json.
@@ -318,6 +321,8 @@ def loop_entry(
         How the loop runs.
     bandwidth, sensitivity_peak : float
         ω_b in rad/s, and ‖S‖∞.
+    places : tuple of BreakPoint
+        Of several sensors on one actuator; margins are the least of all places.
     options : LoopFigureOptions
         Of steps and warnings.
 
@@ -326,8 +331,9 @@ def loop_entry(
     dict
         JSON values.
     """
-    loops = [Loop(plant, controller, sampling) for plant in plants]
-    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
+    loops = [Loop(plant, controller, sampling, places) for plant in plants]
+    margins = [least_of([least_margins(one.responses, one.grid()) for one in loop.places])
+               for loop in loops]  # fmt: skip
     gain = [gain_margin(m) for m in margins]
     worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
     steps = [step_figures(loops[i], bandwidth, options) for i in sorted(worst)]

@@ -14,6 +14,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
     Uncertainty,
+    of_sensor,
 )
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.weights import Weights
@@ -120,6 +121,8 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     if controller.roll_off == 0 and controller.weighted_level is not None:
         words = "is 0: KS would not fall, and weighted_level holds at no frequency; give 1 or more"
         raise fail("controller.roll_off", words)
+    if controller.bandwidth_of is not None:
+        _check_sensors(controller, fail)
     directed = [own.outputs is not None for _, own in controller.channel]
     if any(directed) and not all(directed):
         words = "gives outputs, another channel none; give them for every channel or for none"
@@ -146,6 +149,19 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
             raise fail(f"controller.channel.{name}.M_K", words)
     if len(tables["robust"].plants) > (most := KindOptions.most_plants):
         raise fail("robust.plants", f"names more than {most} plants; name the extreme ones")
+
+
+def _check_sensors(controller: ControllerTable, fail: Fail) -> None:
+    """Raise where several sensors on one actuator cannot be designed as the case says."""
+    for name, own in controller.channel:
+        where = f"controller.channel.{name}"
+        if own.integrator and name != controller.bandwidth_of:
+            words = "is true: two integrators on one actuator drift against each other; leave it to"
+            raise fail(f"{where}.integrator", f"{words} channel {controller.bandwidth_of}")
+        for key in ("inputs", "like", "bandwidth_ratio"):
+            if getattr(own, key) != getattr(ChannelTable, key):
+                words = "has no effect where all channels drive one actuator; drop it"
+                raise fail(f"{where}.{key}", words)
 
 
 def with_structure(case: Case, structure: str) -> Case:
@@ -214,6 +230,7 @@ def structured_problem(case: Case, options: tuple[Options, ...]) -> StructuredPr
         minimise=inner.minimise,
         bandwidth_least=HZ * (inner.bandwidth_least_hz or 0.0),
         channels=_channels(controller),
+        bandwidth_of=controller.bandwidth_of,
     )
 
 
@@ -226,6 +243,9 @@ def _channels(controller: ControllerTable) -> tuple[ChannelProblem, ...]:
         values = {key: getattr(whose, key) for key in keys if getattr(whose, key) is not None}
         structure = replace(usual, **values)
         inputs = own.outputs if own.inputs is None else own.inputs
+        if controller.bandwidth_of is not None:
+            inputs = None if own.outputs is None else (1.0,)
+            structure = of_sensor(structure, name == controller.bandwidth_of)
         bounds = {key: getattr(whose, key) for key in _OF_CHANNELS}
         found.append(ChannelProblem(name, structure, own.outputs, inputs, own.like, **bounds))
     return tuple(found)

@@ -211,6 +211,11 @@ class ControllerTable:
     least_damping: float = key(
         "sections: least damping ratio of zeros and poles", 0.0, check=checks.DAMPING
     )
+    bandwidth_of: str | None = key(
+        "sections: of several sensors on one actuator, the channel whose error counts for ω_b; |S| "
+        "is then bounded where the loop is broken at each sensor and at the actuator",
+        None,
+    )
     starts: int = key(
         "sections: least number of starts; a search goes on until its best is found twice",
         12,

@@ -15,6 +15,7 @@ import numpy as np
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
@@ -275,7 +276,10 @@ def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, fl
     low, high = _searched(problem)
     flexible = plant.natural[plant.natural > 0.0] / HZ
     aim = float(np.clip(flexible[0] / 3.0 if flexible.size else np.sqrt(low * high), low, high))
-    level = np.log(np.maximum(plant.gain, 1e-300))
+    gain = plant.gain  # the least of all directions: 0 where sensors share an actuator
+    if not gain.any():
+        gain = sigma_max(plant.system.response(plant.grid))
+    level = np.log(np.maximum(gain, 1e-300))
     return aim, float(np.exp(np.interp(
         np.log(aim * HZ / plant.omega_0), np.log(plant.grid), level)))  # fmt: skip
 

@@ -19,6 +19,7 @@ from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
+from ccd_casadi.inner_problem.kinds import loop_on
 from ccd_casadi.inner_problem.objective import final_design
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -116,7 +117,7 @@ class FinishedRun(NotebookHtml):
 
     def loop_on(self, plant: StateSpace) -> Loop:
         """The loop on a plant in SI, as it runs."""
-        return Loop(plant, self.controller, self.sampling)
+        return loop_on(self.problem, plant, self.controller)
 
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""

@@ -28,7 +28,11 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import (
+    bounds_of,
+    structured_of,
+    uncertain_plant,
+)
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -117,10 +121,11 @@ def second_on_set(
     uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
     points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
     pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
-    of_GS = ("GS",) if problem.sampling is None else ()
+    of_GS, bounds = ("GS",) if problem.sampling is None else (), bounds_of(problem)
     return compared(
-        (second_opinion(plant, K, problem.sampling),
-         {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)})
+        (second_opinion(plant, K, problem.sampling, places=bounds.places),
+         {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)}
+         | {f"S of {one.name}": one.S_peak for one in figures.channels if bounds.places})
         for plant, figures in pairs
     )  # fmt: skip
 

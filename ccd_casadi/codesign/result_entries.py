@@ -12,7 +12,7 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
+from ccd_casadi.fixed_structure.bounds import BINDS, Place, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
@@ -207,7 +207,9 @@ def design_dict(
     if all(plant.stable for plant in judged.plants):  # else there are no margins and steps
         assert design.controller is not None
         plants = [plant.plant_si() for plant in plants_of(problem, theta)]
-        loop = loop_entry(plants, design.controller, sampling, design.bandwidth, highest.S_peak)
+        bounds = bounds_of(problem)
+        loop = loop_entry(plants, design.controller, sampling, design.bandwidth, highest.S_peak,
+                          bounds.places)  # fmt: skip
     grown = max(plant.stability for plant in judged.plants)
     if sampling is not None:  # of the spectral radius: the real part that it comes from
         grown = float(np.log1p(grown)) / sampling.period
@@ -299,6 +301,9 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
             "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
             "bandwidth_ratio": own.bandwidth_ratio,
         }
+        if own.place is not Place.WHOLE:  # |S| where the loop is broken there alone
+            del entry["bandwidth_hz"], entry["bandwidth_ratio"]
+            entry["place"] = own.place.value
         if own.M_K is not None:
             entry |= {"M_K": own.M_K, "weighted_KS": max(row.weighted_KS for row in rows)}
         found.append(entry)
@@ -331,14 +336,14 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
         "words": proof.words,
         "slack": proof.slack,
         "parameters": list(proof.parameters),
-        "levels": {BINDS[name]: level for name, level in proof.levels.items()},
+        "levels": {key_words(name): level for name, level in proof.levels.items()},
         "boxes": proof.boxes,
     }
     if proof.refuted:
         found |= {
             "option": proof.option,
             "point": list(proof.point),
-            "passed": [BINDS[proof.passed[0]], proof.passed[1]],
+            "passed": [key_words(proof.passed[0]), proof.passed[1]],
         }
     return found
 

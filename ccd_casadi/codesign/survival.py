@@ -8,9 +8,9 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
-from ccd_casadi.inner_problem.kinds import MixedSensitivity
+from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.loop import Loop, Sampling, tustin
+from ccd_casadi.lti.loop import BreakPoint, Loop, Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import (
     FREE,
@@ -23,7 +23,7 @@ from ccd_casadi.plants.modal import (
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.closed_loop import least_margins
+from ccd_casadi.synthesis.closed_loop import least_margins, least_of
 from ccd_casadi.synthesis.statics import Statics, StaticsOptions, statics
 
 PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
@@ -65,6 +65,8 @@ class LoopsOffModel:
         Of the modal damping matrix, 1/s.
     given : bool
         Whether the plant's damping is a matrix, not ratios.
+    places : tuple of BreakPoint
+        Of several sensors on one actuator.
     options : SurvivalOptions
         Numbers of the ranges.
     known : dict
@@ -78,6 +80,7 @@ class LoopsOffModel:
     matrix: Array
     grows: Array
     given: bool
+    places: tuple[BreakPoint, ...] = ()
     options: SurvivalOptions = SurvivalOptions()
     known: dict[Perturbation, Loop] = field(default_factory=dict, compare=False)
 
@@ -99,7 +102,8 @@ class LoopsOffModel:
     def at(self, off: Perturbation) -> Loop:
         """The loop on a perturbed plant."""
         if off not in self.known:
-            self.known[off] = Loop(self.modal(off).state_space, self.run, self.sampling)
+            plant = self.modal(off).state_space
+            self.known[off] = Loop(plant, self.run, self.sampling, self.places)
         return self.known[off]
 
     @cached_property
@@ -142,6 +146,7 @@ def loops_off_model(
     controller: StateSpace,
     sampling: Sampling | None = None,
     suspension: Suspension = FREE,
+    places: tuple[BreakPoint, ...] = (),
 ) -> LoopsOffModel:
     """The loops of a controller on a plant given by its matrices.
 
@@ -155,6 +160,8 @@ def loops_off_model(
         How the loop runs.
     suspension : Suspension
         What holds its free bodies.
+    places : tuple of BreakPoint
+        Of several sensors on one actuator.
 
     Returns
     -------
@@ -173,7 +180,7 @@ def loops_off_model(
     grows = (D(Perturbation(shift=0.5)) - plant.D) / 0.5
     given = system.damping_ratio is None
     rest = plant.D - matrix
-    return LoopsOffModel(plant, controller, sampling, rest, matrix, grows, given)
+    return LoopsOffModel(plant, controller, sampling, rest, matrix, grows, given, places)
 
 
 Function = Callable[[float], float]
@@ -227,7 +234,8 @@ def loops_of(
         Of the model at θ.
     """
     system = mechanics(plant_of(problem), theta)
-    return loops_off_model(system, controller, problem.sampling, problem.suspension.free)
+    places = kind_of(problem).bounds().places
+    return loops_off_model(system, controller, problem.sampling, problem.suspension.free, places)
 
 
 def growth_of(loop: Loop) -> float:
@@ -396,7 +404,7 @@ def survival(
     within, exceeded = range_within(
         loops, partial(shift_range, loops, marks=marks), S_max, slack, held
     )
-    margins = least_margins(nominal.responses, nominal.grid())
+    margins = least_of([least_margins(one.responses, one.grid()) for one in nominal.places])
     poles = np.linalg.eigvals(loops.controller.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
     size = np.maximum(1e-9 * sizes, StaticsOptions().integrator * bandwidth)

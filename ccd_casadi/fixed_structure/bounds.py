@@ -7,6 +7,7 @@ from math import log, nan
 
 import numpy as np
 
+from ccd_casadi.lti.loop import BreakPoint
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
@@ -205,9 +206,6 @@ class Bounds:
     error: int | None = None
 
     def __post_init__(self) -> None:
-        if self.error is not None and self.weighted_level is not None:
-            words = "weighted_level is of one sensor for each actuator; leave it out"
-            raise ValueError(f"{words}, |S| is bounded at every sensor and at the actuator")
         if not self.S_max > 1.0:
             raise ValueError(f"S_max is {self.S_max}; no loop with roll-off stays below 1")
         if not self.S_low > 0.0 or not self.omega_low > 0.0:
@@ -228,6 +226,17 @@ class Bounds:
             if own.M_K is not None and self.weights and not 0.0 < own.M_K <= self.weights.M_K:
                 words = f"M_K of channel {own.name} is {own.M_K}"
                 raise ValueError(f"{words}; give more than 0, at most that of the weights")
+
+    @property
+    def places(self) -> tuple[BreakPoint, ...]:
+        """Where loops of several sensors on one actuator are broken, that whose error counts first;
+        empty of other loops."""
+        if self.error is None:
+            return ()
+        found = [BreakPoint(own.name, own.output, own.reference)
+                 if own.place is Place.SENSOR else BreakPoint(own.name)
+                 for own in self.channels]  # fmt: skip
+        return (found[self.error], *found[: self.error], *found[self.error + 1 :])
 
     @property
     def opens(self) -> bool:

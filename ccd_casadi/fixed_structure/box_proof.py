@@ -9,6 +9,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.break_points import SensorFamily
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
@@ -312,7 +313,8 @@ def prove(
         Of every bound the factor below which its figure is proven.
     """
     names = uncertain.names
-    many = isinstance(structure, ChannelStructure) or len(names) > options.few_parameters
+    several = isinstance(structure, ChannelStructure) and bounds.error is None
+    many = several or len(names) > options.few_parameters
     slack = slack or (options.slack_of_many if many else options.slack)
     outputs, inputs = structure.directions
     if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
@@ -327,7 +329,7 @@ def prove(
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
-    families = []
+    families, family = [], LoopFamily if bounds.error is None else SensorFamily
     for option in range(len(models)):
         low_pass = _low_pass(uncertain.options[option], sampling, options.poles_apart)
         if low_pass is None:
@@ -336,7 +338,7 @@ def prove(
         if plant is None:
             why = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
             return Proof(why, slack, names)
-        families.append(LoopFamily(
+        families.append(family(
             plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay,
             tuple((low_pass / unit).tolist()),
         ))  # fmt: skip
@@ -344,7 +346,8 @@ def prove(
     if many and most_boxes is None:
         share, enough = min(share, options.most_boxes_of_many), options.stuck_boxes_of_many
     proof = divide(families, uncertain.box, slack, share, workers, enough, options)
-    return replace(proof, channels=any(own.given for own in bounds.channels))
+    # where sensors share an actuator every place is enclosed
+    return replace(proof, channels=bounds.error is None and any(c.given for c in bounds.channels))
 
 
 def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.ndarray | None:

@@ -162,7 +162,7 @@ class LoopResponses:
         self, matrices: dict[str, np.ndarray], omega: Array, sizes: dict[str, Array] | None = None
     ) -> dict[str, Array]:
         if self.bounds.error is not None:
-            return self._broken(matrices)
+            return self._broken(matrices, omega)
         found = sizes or {name: sigma_max(M) for name, M in matrices.items()}
         weights = self.weights(omega)
         found |= {f"weighted {name}": W * found[name] for name, W in weights.items()}
@@ -174,7 +174,7 @@ class LoopResponses:
                 found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
-    def _broken(self, matrices: dict[str, np.ndarray]) -> dict[str, Array]:
+    def _broken(self, matrices: dict[str, np.ndarray], omega: Array) -> dict[str, Array]:
         """Of sensors that share an actuator: S, T and GS of the one whose error counts, and S of
         the loop that is broken at each place."""
         own = self.bounds.channels[self.bounds.error or 0]
@@ -185,7 +185,8 @@ class LoopResponses:
             at_sensor = one.place is Place.SENSOR
             broken = matrices["S"] if at_sensor else matrices["S at the actuator"]
             found[f"S of {one.name}"] = np.abs(entry_of(one, broken))
-        return found
+        weights = self.weights(omega)
+        return found | {f"weighted {name}": W * found[name] for name, W in weights.items()}
 
     def sensitivity(
         self, which: np.ndarray, omega: Array, row: Sequence[float] | None = None

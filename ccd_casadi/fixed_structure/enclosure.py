@@ -51,6 +51,15 @@ class Enclosures:
     spread: Array
     bounded: np.ndarray
 
+    def improved(self, near: np.ndarray, rest: "Enclosures") -> "Enclosures":
+        """With what `rest` knows of the boxes `near`, upper bounds alone."""
+        better = rest.highest.max(axis=0) < self.highest[:, near].max(axis=0)
+        highest, spread, bounded = self.highest.copy(), self.spread.copy(), self.bounded.copy()
+        highest[:, near] = np.minimum(rest.highest, highest[:, near])
+        spread[:, near] = np.where(better, rest.spread, spread[:, near])
+        bounded[near] |= rest.bounded
+        return Enclosures(self.names, highest, self.lowest, spread, bounded)
+
 
 class FigureBounds(NamedTuple):
     """A norm on N boxes: at most `upper`, at least `lower` (N,), and what makes it uncertain: each
@@ -272,18 +281,17 @@ class LoopFamily:
             Infinite above and 0 below where an inequality above does not hold.
         """
         found = self._with_finite_modes(boxes)
+        near = self.near_rest(boxes)
+        if not near.any():
+            return found
+        return found.improved(near, self._at_rest(boxes.only(near)))
+
+    def near_rest(self, boxes: Boxes) -> np.ndarray:
+        """The boxes up to ω_low of a plant with free bodies, which are infinite at 0 Hz."""
         slow = self.bounds.omega_low / self.unit * (self.period or 1.0)
         near = (boxes.low[0] == 0.0) | (boxes.high[0] <= slow)
         near &= np.isin(boxes.chart, (Chart.LOW, Chart.SAMPLED))
-        if not (self.plant.rigid.any() and near.any()):
-            return found
-        rest = self._at_rest(boxes.only(near))
-        better = rest.highest.max(axis=0) < found.highest[:, near].max(axis=0)
-        highest, spread, bounded = found.highest.copy(), found.spread.copy(), found.bounded.copy()
-        highest[:, near] = np.minimum(rest.highest, highest[:, near])
-        spread[:, near] = np.where(better, rest.spread, spread[:, near])
-        bounded[near] |= rest.bounded
-        return Enclosures(found.names, highest, found.lowest, spread, bounded)
+        return np.asarray(near & self.plant.rigid.any())
 
     def _with_finite_modes(self, boxes: Boxes) -> Enclosures:
         """The figures of (11) to (19) over their bounds, on boxes on which every mode is finite."""

@@ -199,9 +199,11 @@ class LoopProblem:
                 for curve in (LoopCurve.CROSSING, LoopCurve.LEVEL, LoopCurve.SHAPE):
                     alone[curve, i] = whole[curve, 0]
         if b.error is not None:  # |S| is that of one sensor, not a norm over sensors
-            own = [curve for curve in LoopCurve if curve != LoopCurve.S_MAX]
+            own = [curve for curve in LoopCurve if curve not in (LoopCurve.S_MAX, LoopCurve.KS)]
             alone[own, b.error] = whole[own, 0]
+            force = whole[LoopCurve.KS, 0]  # of all references together
             whole[: len(LoopCurve)] = np.inf
+            whole[LoopCurve.KS, 0] = force
         return found
 
     @cached_property

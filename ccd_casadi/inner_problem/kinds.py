@@ -266,6 +266,21 @@ def bandwidth_gradient(
     return np.asarray(theta[0] - mu @ slopes)
 
 
+def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace) -> Loop:
+    """Close the loop of a controller on a plant as it runs.
+
+    Parameters
+    ----------
+    problem, plant, controller : CoDesignProblem, StateSpace, StateSpace
+        SI; of several sensors on one actuator the loop of the one whose error counts.
+
+    Returns
+    -------
+    Loop
+    """
+    return Loop(plant, controller, problem.sampling, kind_of(problem).bounds().places)
+
+
 def design_loops(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> list[Loop]:
@@ -282,7 +297,7 @@ def design_loops(
         As they run, the model's first.
     """
     plants = kind_of(problem).plants(theta)
-    return [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
+    return [loop_on(problem, plant.plant_si(), controller) for plant in plants]
 
 
 def design_view(
@@ -312,7 +327,7 @@ def design_view(
     """
     bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
     plants = kind_of(problem).members(theta)  # whose figures the result has
-    loops = [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
+    loops = [loop_on(problem, plant.plant_si(), controller) for plant in plants]
     return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
 
 

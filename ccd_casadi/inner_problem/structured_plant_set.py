@@ -17,13 +17,18 @@ from ccd_casadi.fixed_structure.channel_structure import (
     channel_plant,
     find_decoupling,
     given_decoupling,
+    sensors_on_one_actuator,
 )
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
+from ccd_casadi.inner_problem.structured_problem import (
+    ChannelProblem,
+    StructuredProblem,
+    of_sensor,
+)
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -75,12 +80,27 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         weights=problem.weights if weighted else None,
         compliance_max=structured.compliance_max,
         channels=_channel_bounds(problem),
+        error=_error_channel(problem),
     )
+
+
+def _error_channel(problem: CoDesignProblem) -> int | None:
+    """The number of the channel whose error counts, of several sensors on one actuator."""
+    name = structured_of(problem).bandwidth_of
+    if name is None:
+        return None
+    channels = structured_of(with_channels(problem)).channels
+    return [channel.name for channel in channels].index(name)
 
 
 def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
     """The channels' own, where they are tighter than the whole's; none where none is."""
     structured = structured_of(problem)
+    if structured.bandwidth_of is not None:
+        structure = structure_of(problem)
+        assert isinstance(structure, ChannelStructure)
+        own_peaks = {c.name: c.S_max for c in structured.channels if c.S_max is not None}
+        return sensors_on_one_actuator(structure.decoupling, problem.inner.S_max, own_peaks)
     whole = {"S_max": problem.inner.S_max, "M_K": problem.weights.M_K}
     given = {}
     for channel in structured.channels:
@@ -127,6 +147,8 @@ def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
     given = [channel.outputs is not None for channel in structured.channels]
     if plant_of(problem).outputs == 1 or any(given):
         return problem
+    if structured.bandwidth_of is not None:
+        return with_structured(problem, channels=_of_sensors(problem))
     found = find_decoupling(scaled_plant(problem, problem.start))
     channels = []
     for i, name in enumerate(found.names):
@@ -134,6 +156,19 @@ def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
         outputs, inputs = (tuple(map(float, M[:, i])) for M in (found.outputs, found.inputs))
         channels.append(replace(own, outputs=outputs, inputs=inputs))
     return with_structured(problem, channels=tuple(channels))
+
+
+def _of_sensors(problem: CoDesignProblem) -> tuple[ChannelProblem, ...]:
+    """A channel for each output, named "1", "2", ..., with what the case gives for it."""
+    structured, count = structured_of(problem), plant_of(problem).outputs
+    known = {channel.name: channel for channel in structured.channels}
+    channels = []
+    for i in range(count):
+        name, rows = str(i + 1), np.eye(count)
+        usual = of_sensor(structured.structure, name == structured.bandwidth_of)
+        own = known.get(name, ChannelProblem(name, usual))
+        channels.append(replace(own, outputs=tuple(map(float, rows[i])), inputs=(1.0,)))
+    return tuple(channels)
 
 
 def nearby(
@@ -337,6 +372,8 @@ def warm_starts_at(
 
     if isinstance(structure, Structure):
         return [nearer(structure, first, list(plants), kappa, bounds) for kappa in warm_starts]
+    if bounds.error is not None:  # one sensor's loop alone says nothing of the whole
+        return warm_starts
     warm = [kappa.copy() for kappa in warm_starts]
     for i in structure.free:
         own, place = structure.structures[i], structure.slices[i]

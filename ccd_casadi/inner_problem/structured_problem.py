@@ -84,6 +84,12 @@ class ChannelProblem:
         return found | {"structure": vars(self.structure)}
 
 
+def of_sensor(structure: Structure, counts: bool) -> Structure:
+    """The structure of one of several sensors on one actuator: the one whose error counts alone may
+    have an integrator, as a second one would drift against it."""
+    return replace(structure, integrator=structure.integrator and counts)
+
+
 @dataclass(frozen=True)
 class StructuredProblem(ControllerProblem):
     """A controller of fixed structure: its bounds beyond S_max and S_low, its plants, its search.
@@ -108,6 +114,8 @@ class StructuredProblem(ControllerProblem):
         "bandwidth", "rms_error" or "move_time"; the last two at ω_b >= bandwidth_least (rad/s).
     channels : tuple of ChannelProblem
         Of a plant with several outputs.
+    bandwidth_of : str or None
+        Of several sensors on one actuator: the channel whose error counts.
     error_warm_starts : tuple of κ in SI
         Of the least RMS error or move time.
     """
@@ -128,6 +136,7 @@ class StructuredProblem(ControllerProblem):
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
     error_warm_starts: tuple[tuple[float, ...], ...] = ()
+    bandwidth_of: str | None = None
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -142,7 +151,12 @@ class StructuredProblem(ControllerProblem):
         """Raise PlantError unless each has as many inputs as outputs, and channels for them."""
         for plant in plants:
             m, p = plant.inputs, plant.outputs
-            if m != p:
+            if self.bandwidth_of is not None:
+                self._require_sensors(m, p)
+            elif m == 1 < p:
+                words = "name the channel whose error counts for the bandwidth"
+                raise PlantError(f"has {p} outputs and 1 input; {words}: controller.bandwidth_of")
+            elif m != p:
                 words = 'controller.structure = "sections" needs as many of one as of the other'
                 counts = f"has {m} inputs and {p} outputs"
                 raise PlantError(f'{counts}; {words}: leave some out, or "h_infinity"')
@@ -167,6 +181,18 @@ class StructuredProblem(ControllerProblem):
             elif not set(found) <= {str(i + 1) for i in range(p)}:
                 words = "where none gives outputs; name one of them, or give them"
                 raise PlantError(f"has channels 1 to {p} {words}")
+
+    def _require_sensors(self, inputs: int, outputs: int) -> None:
+        """Raise PlantError unless these are several sensors on one actuator, each a channel."""
+        if inputs != 1 or outputs == 1:
+            words = f"has {inputs} inputs and {outputs} outputs"
+            remedy = "is of several sensors on one actuator; drop it"
+            raise PlantError(f"{words}; controller.bandwidth_of {remedy}")
+        given = any(channel.outputs is not None for channel in self.channels)
+        names = [c.name for c in self.channels] if given else [str(i + 1) for i in range(outputs)]
+        if self.bandwidth_of not in names:
+            words = f"{self.bandwidth_of!r} is none of the channels {', '.join(names)}"
+            raise PlantError(f"controller.bandwidth_of = {words}; name one of them")
 
     def with_warm_start(self, kappa: tuple[float, ...], most: int) -> Self:
         """With one more warm start of what it minimises, first, `most` at most; as it is by the κ
@@ -210,6 +236,8 @@ class StructuredProblem(ControllerProblem):
                 found["room"] = "opens from the bandwidth on"
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
+        if self.bandwidth_of is not None:
+            found["bandwidth_of"] = self.bandwidth_of
         if self.figure is not BANDWIDTH:
             found["least_error"] = [self.bandwidth_least, self.error_warm_starts]
         return found

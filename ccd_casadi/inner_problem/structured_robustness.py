@@ -307,7 +307,7 @@ def recertified(
         return design
     judged = certify(
         plants_of(problem, theta), design.controller, bounds_of(problem), problem.sampling,
-        integrator=structure_of(problem).integrator,
+        integrator=structure_of(problem).integrates(bounds_of(problem).error),
     )  # fmt: skip
     again = replace(design, certificate=judged)
     least = design.bandwidth * (1.0 - StructuredValueOptions.rounding)
@@ -346,5 +346,5 @@ def _judged(
 ) -> SetCertificate:
     return certify(
         plants, controller, bounds_of(problem).looser(loose), problem.sampling,
-        integrator=structure_of(problem).integrator, workers=workers,
+        integrator=structure_of(problem).integrates(bounds_of(problem).error), workers=workers,
     )  # fmt: skip

@@ -138,9 +138,8 @@ def row_of(row, M, rows, columns):
 
 @compiled
 def broken(curve, kind):
-    """Kind of a gain: where the loop is broken it is of S alone, other curves count rows."""
-    of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
-    return kind if of_s else COUNTED_ROW
+    """Kind of a gain: where the loop is broken it is of S and T, other curves count rows."""
+    return kind if curve != LoopCurve.KS and curve != LoopCurve.GS else COUNTED_ROW
 
 
 @compiled

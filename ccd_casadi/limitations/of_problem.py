@@ -197,6 +197,8 @@ def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[
         raise UserError('gap: is known for controller.structure = "sections" alone')
     if problem.figure is not BANDWIDTH:
         raise UserError("gap: is known for the bandwidth alone; drop inner.minimise")
+    if structured_of(problem).bandwidth_of is not None:
+        raise UserError("gap: is known for one sensor for each actuator; drop bandwidth_of")
     uncertain, structure = uncertain_plant(problem, theta), structure_of(problem)
     plant = uncertain.plant(uncertain.nominal).plant_si()
     bounds, sampling = bounds_of(problem), structured_of(problem).sampling

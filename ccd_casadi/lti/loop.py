@@ -12,6 +12,7 @@ from ccd_casadi.lti.state_space import (
     ClosedLoop,
     StateSpace,
     closed_loop,
+    responses_of,
     sensitivity,
     sigma_max,
     strictly_proper,
@@ -251,6 +252,50 @@ def in_w(G: StateSpace) -> StateSpace:
 
 
 @dataclass(frozen=True)
+class BreakPoint:
+    """Where the loop of several sensors on one actuator is broken.
+
+    Attributes
+    ----------
+    name : str
+    output, reference : tuple of float (p,)
+        uᵀe is what the channel of a sensor sees, r the reference that it alone sees; empty: at the
+        actuator.
+    """
+
+    name: str
+    output: tuple[float, ...] = ()
+    reference: tuple[float, ...] = ()
+
+    def opened(self, G: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The loop that is left, as a plant and a controller of one channel.
+
+            L_i = G_i K_i/(1 + Σ_{j≠i} G_j K_j) at sensor i,   L = Σ_j G_j K_j at the actuator
+
+        Parameters
+        ----------
+        G, K : array (k, p, 1), (k, 1, p)
+
+        Returns
+        -------
+        tuple of array (k, 1, 1)
+        """
+        L = K @ G
+        if not self.output:
+            return L, np.ones_like(L)
+        own, gain = np.array([self.output]) @ G, K @ np.array([self.reference]).T
+        return own / (1.0 + L - own * gain), gain
+
+    def closed(self, loop: ClosedLoop) -> ClosedLoop:
+        """The closed loop, whose S is that of the loop broken here."""
+        if not self.output:
+            none = np.zeros((1, 1))
+            return replace(loop, B_r=loop.B_d, C_y=-loop.C_u, D_u=none)
+        row, column = np.array([self.output]), np.array([self.reference]).T
+        return replace(loop, B_r=loop.B_r @ column, C_y=row @ loop.C_y, D_u=loop.D_u @ column)
+
+
+@dataclass(frozen=True)
 class Loop:
     """A feedback loop as it runs.
 
@@ -262,14 +307,35 @@ class Loop:
         K in SI; one in discrete time runs as it is, at the rate of `sampling`.
     sampling : Sampling, optional
         Without, the loop is continuous.
+    at : tuple of BreakPoint
+        Of several sensors on one actuator: first where the error counts, of which responses and S
+        are, then the other places, which `peak` has too.
     """
 
     plant: StateSpace
     controller: StateSpace
     sampling: Sampling | None = None
+    at: tuple[BreakPoint, ...] = ()
+
+    @property
+    def places(self) -> "list[Loop]":
+        """The loop broken at each place by itself."""
+        return [replace(self, at=(one,)) for one in self.at] or [self]
 
     def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         """G (k, p, m), hold and delay in it, and K (k, m, p) as they run, at ω (k,) in rad/s."""
+        G, K = self._responses(omega)
+        return self.at[0].opened(G, K) if self.at else (G, K)
+
+    def curves(self, omega: Array) -> dict[str, np.ndarray]:
+        """S, T, KS and GS as matrices (k, ·, ·); KS the whole force."""
+        found = responses_of(*self.responses(omega))
+        if self.at and self.at[0].output:
+            G, K = self._responses(omega)
+            found["KS"] = K @ np.array([self.at[0].reference]).T / (1.0 + K @ G)
+        return found
+
+    def _responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         G, K = self.as_run
         if self.sampling is None or self.plant.modes is None:
             return G.swept(omega), K.swept(omega)
@@ -286,6 +352,8 @@ class Loop:
     def closed(self) -> ClosedLoop:
         """The closed loop, sampled at its instants; a disturbing force is held, and not delayed."""
         found = closed_loop(*self.as_run)
+        if self.at:
+            found = self.at[0].closed(found)
         if self.sampling is None:
             return found
         force = np.zeros((len(found.A), self.plant.B.shape[1]))
@@ -328,6 +396,8 @@ class Loop:
     @cached_property
     def peak(self) -> float:
         """‖S‖∞ of a stable loop: every local maximum on the grid near the largest closed in on."""
+        if len(self.at) > 1:
+            return max(one.peak for one in self.places)
 
         def gain(omega: Array) -> Array:
             return sigma_max(self.sensitivity(omega.ravel())).reshape(omega.shape)

@@ -228,7 +228,9 @@ def _line(
     """The plants at these places, and between what the loop is stable, and within S_max, by the
     search that the verdict of a solve makes; `model`: its place, where not even there; `held`: the
     ends of the set's own part of the line."""
-    loops = loops_off_model(run.system, run.controller, run.sampling, run.problem.suspension.free)
+    problem = run.problem
+    loops = loops_off_model(run.system, run.controller, run.sampling, problem.suspension.free,
+                            kind_of(problem).bounds().places)  # fmt: skip
     nominal, stable, within, slack = loops.at(Perturbation()), (model, model), (model, model), PEAK
     held = (max(held[0], min(places)), min(held[1], max(places)))
     if nominal.stable:

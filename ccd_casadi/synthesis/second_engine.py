@@ -6,7 +6,7 @@ a grid. Where two engines differ one of them is wrong, so the design is not to b
 """
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 import slycot
 
 from ccd_casadi.lti.frequency_grid import root_flanks
-from ccd_casadi.lti.loop import Sampling, in_w, sampled, tustin
+from ccd_casadi.lti.loop import BreakPoint, Sampling, in_w, sampled, tustin
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, balanced, closed_loop, weighted
 from ccd_casadi.support.errors import described
@@ -73,6 +73,7 @@ def second_opinion(
     controller: StateSpace,
     sampling: Sampling | None = None,
     weights: Weights | None = None,
+    places: Sequence[BreakPoint] = (),
 ) -> SecondOpinion:
     """SLICOT on the loop of a plant (u to y) and a controller K(s) (e = r - y to u), both in SI.
 
@@ -84,6 +85,9 @@ def second_opinion(
         The plant behind its hold and delay, K by Tustin's rule; then there is no weighted norm.
     weights : Weights, optional
         Those of mixed sensitivity, with their disturbance where they have one.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: "S", "T" and "GS" are of the first place, "S of NAME" of
+        each.
 
     Returns
     -------
@@ -103,6 +107,10 @@ def second_opinion(
         if not rate < 0.0:
             return SecondOpinion(False, rate, {"S": inf})
         parts = {"S": loop.S, "KS": loop.KS, "T": loop.T}
+        if places:
+            whole, loop = loop, places[0].closed(loop)
+            parts = {"S": loop.S, "KS": whole.KS, "T": loop.T}
+            parts |= {f"S of {place.name}": place.closed(whole).S for place in places}
         if not loop.period:  # sampled it is a product of functions of z and of s
             parts["GS"] = loop.GS
         norms = {name: _norm(part) for name, part in parts.items()}

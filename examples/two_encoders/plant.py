@@ -1,0 +1,27 @@
+"""A ball-screw axis with two encoders, in metres of table travel: one on the motor, one at the table.
+
+The screw's diameter d makes it stiff and heavy to turn, its lead r makes the motor's inertia count
+for less. x = [motor, table]; the inertia J of motor and screw counts as J (2π/lead)².
+"""
+
+import casadi as ca
+
+STEEL, DENSITY = 210e9, 7850.0  # N/m², kg/m³
+LENGTH, MOTOR, TABLE = 0.9, 2.0e-3, 120.0  # m of screw, kg m², kg
+
+
+def axis(theta, damping_ratio=0.02):
+    d, lead = 1e-3 * theta["diameter"], 1e-3 * theta["lead"]
+    core, gear = 0.85 * d, 2.0 * ca.pi / lead
+    turned = (MOTOR + DENSITY * ca.pi * d**4 / 32.0 * LENGTH) * gear**2  # kg
+    screw, nut, bearing = STEEL * ca.pi * core**2 / 4.0 / LENGTH, 1.2e10 * d, 3.0e8
+    k = 1.0 / (1.0 / screw + 1.0 / nut + 1.0 / bearing)  # N/m
+    return {
+        "mass": ca.diag(ca.vertcat(turned, TABLE)),
+        "damping_ratio": damping_ratio,
+        "stiffness": k * ca.DM([[1.0, -1.0], [-1.0, 1.0]]),
+        "input": ca.DM([1.0, 0.0]),
+        "output": ca.DM([[1.0, 0.0], [0.0, 1.0]]),
+        "hardware_cost": (turned + TABLE) / 1000.0,  # t, what the motor accelerates
+        "constraints": {},
+    }
