@@ -35,7 +35,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, run_race, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
-from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
 from ccd_casadi.support.arrays import Array
@@ -167,6 +167,8 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     shared = min(len(M) for M in structure.directions) < len(structure.structures)
     if shared and not only_initial:
         rng = np.random.default_rng(search.seed)
+        if problem.bounds.error is not None:
+            field += _stable(problem, search.inside(_of_sensors(search, problem, alike)))
         field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
         evaluations += len(field)
     elif not field or not only_initial:
@@ -185,6 +187,35 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     runners = run_race(problem, np.array(field), tell, search.workers, known=known,
                        options=search.options.multi_start)  # fmt: skip
     return search.concluded(runners, len(field), evaluations)
+
+
+def _of_sensors(
+    search: DesignSearch, problem: CompositeProblem, alike: Sequence[ScaledPlant]
+) -> list[Array]:
+    """Controllers κ in SI of one sensor alone, the others' gains as small as they may be."""
+    bounds = replace(problem.bounds, channels=(), error=None)
+    least, found = np.exp(problem.box[0]), list[Array]()
+    smallest = problem.structure.in_units(
+        np.log(np.maximum(least, 1e-300)), problem.plants.omega_0, problem.plants.force
+    )
+    middle = problem.structure.in_units(
+        problem.box.mean(axis=0), problem.plants.omega_0, problem.plants.force
+    )
+    gains = np.array([kind is ParameterKind.GAIN for kind in problem.structure.kinds])
+    for i, own in enumerate(problem.structure.structures):
+        plants = [channel_plant(plant, problem.structure.decoupling, i) for plant in alike]
+        alone = problem_for(plants, own, bounds, search.sampling, span_of(problem),
+                            margin=problem.margin)  # fmt: skip
+        name = problem.structure.decoupling.names[i]
+        made = of_one_channel(replace(
+            search, problem=alone, plants=plants, initial=[], began=perf_counter(),
+            tell=titled(search.tell, f"sensor {name} alone"),
+        ))  # fmt: skip
+        if np.isfinite(made.kappa).all():
+            kappa = np.where(gains, smallest, middle)
+            kappa[problem.structure.slices[i]] = made.kappa
+            found.append(kappa)
+    return found
 
 
 def _of_channels(

@@ -9,8 +9,14 @@ import casadi as ca
 STEEL, DENSITY = 210e9, 7850.0  # N/m², kg/m³
 LENGTH, MOTOR, TABLE = 0.9, 2.0e-3, 120.0  # m of screw, kg m², kg
 
+SENSORS = {
+    "both": ca.DM([[1.0, 0.0], [0.0, 1.0]]),
+    "motor": ca.DM([[1.0, 0.0]]),
+    "table": ca.DM([[0.0, 1.0]]),
+}
 
-def axis(theta, damping_ratio=0.02):
+
+def axis(theta, damping_ratio=0.02, sensor="both"):
     d, lead = 1e-3 * theta["diameter"], 1e-3 * theta["lead"]
     core, gear = 0.85 * d, 2.0 * ca.pi / lead
     turned = (MOTOR + DENSITY * ca.pi * d**4 / 32.0 * LENGTH) * gear**2  # kg
@@ -21,7 +27,7 @@ def axis(theta, damping_ratio=0.02):
         "damping_ratio": damping_ratio,
         "stiffness": k * ca.DM([[1.0, -1.0], [-1.0, 1.0]]),
         "input": ca.DM([1.0, 0.0]),
-        "output": ca.DM([[1.0, 0.0], [0.0, 1.0]]),
+        "output": SENSORS[sensor],
         "hardware_cost": (turned + TABLE) / 1000.0,  # t, what the motor accelerates
         "constraints": {},
     }
