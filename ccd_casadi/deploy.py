@@ -69,6 +69,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         remedy = "solve it again, or give --unverified to deploy it nevertheless"
         say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
         return ExitCode.NOT_VERIFIED
+    if kind_of(finished.problem).bounds().places:
+        words = "several sensors on one actuator are not deployed yet"
+        remedy = "controller.json has K(s), which runs by Tustin's rule at loop.rate_hz"
+        raise UserError(f"{options.run}: {words}; {remedy}")
     folder = run_folder(options.run, options.out or options.run / "deploy")
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"

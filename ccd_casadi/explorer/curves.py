@@ -16,7 +16,7 @@ from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.frequency_grid import frequency_grid
@@ -88,7 +88,7 @@ def curves_of(look: Look) -> Curves | None:
     if look.controller is None:
         return None
     plant, K, problem = look.plant, look.controller, look.problem
-    loop = Loop(plant.plant_si(), K, problem.sampling)
+    loop = loop_on(problem, plant.plant_si(), K)
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
     bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)

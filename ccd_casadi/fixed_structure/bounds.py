@@ -266,7 +266,7 @@ class Bounds:
         if weights is not None and own.M_K is not None:
             weights = replace(weights, M_K=own.M_K)
         peak = self.S_max if own.S_max is None else own.S_max
-        return replace(self, S_max=peak, weights=weights, channels=())
+        return replace(self, S_max=peak, weights=weights, channels=(), error=None)
 
     def lead(self, number: int) -> float:
         """ln of a channel's bandwidth over ω_b."""

@@ -171,7 +171,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
             field += _stable(problem, search.inside(_of_sensors(search, problem, alike)))
         field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
         evaluations += len(field)
-    elif not field or not only_initial:
+    elif problem.bounds.error is None and (not field or not only_initial):
         before: list[SectionsDesign] = []
         for share in search.options.peak_shares:
             before = _of_channels(search, problem, alike, share, before)

@@ -252,6 +252,9 @@ def channel_words(own: Mapping[str, Any]) -> str:
     peak = f"peak {own['sensitivity_peak']:.6g} at {own['sensitivity_peak_hz']:.4g} Hz"
     if own["S_max"] is not None:
         peak += f" (S_max {own['S_max']:g})"
+    if "place" in own:
+        where = "the actuator" if own["place"] == "actuator" else f"sensor {own['name']}"
+        return f"broken at {where}: {peak}"
     words = f"channel {own['name']}: {peak}, {own['bandwidth_hz']:.6g} Hz"
     if own["bandwidth_ratio"] > 1.0:
         words += f" (at least {own['bandwidth_ratio']:g} ω_b)"

@@ -16,10 +16,9 @@ from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
-from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.gain_figures import of_plants
@@ -108,7 +107,7 @@ def cycle_chapter(
 def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
     """The position of every plant after a step of 1 N, of the pair that moves most."""
     K, bandwidth = view.loop.controller, HZ * view.bandwidth_hz
-    loops = [Loop(one.plant_si(), K, problem.sampling) for one in kind_of(problem).members(theta)]
+    loops = [loop_on(problem, one.plant_si(), K) for one in kind_of(problem).members(theta)]
     most, seconds = largest_force_step(loops, bandwidth), max(map(rest_time, loops))
     drawn = []
     for loop in loops:

@@ -41,7 +41,8 @@ def _claims(r: Mapping[str, Any], problem: CoDesignProblem) -> Iterator[tuple[bo
         yield r["sensitivity_peak"] <= S_max * (1.0 + CLOSE), "certified, S above S_max"
 
     kkt = r["kkt"]["stationarity"]
-    sure = checks["optimality"] and checks["inner_optimum"] is not False
+    # None: a search that its time ended, of which nothing is known
+    sure = checks["optimality"] is not False and checks["inner_optimum"] is not False
     yield failed["optimal"] == (not sure), "optimal line and checks"
     if not sections:
         stationary = kkt is not None and kkt <= VerifiedDesign.kkt_level
