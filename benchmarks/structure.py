@@ -57,6 +57,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.plants.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
     "ccd_casadi.plants.rigid_modes": ("EPS",),
     "ccd_casadi.plants.table_columns": ("COMPLIANCE",),
+    "ccd_casadi.records.signal_names": ("UNITS",),
     "ccd_casadi.sampling.store": ("SCHEMA",),
     "ccd_casadi.studies.backends": ("BISECT", "SUBOPTIMAL"),
     "ccd_casadi.synthesis.closed_loop": ("EPS",),

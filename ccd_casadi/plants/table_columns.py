@@ -11,6 +11,15 @@ import scipy
 
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text_table import (
+    READ,
+    cells,
+    decimal_comma,
+    is_number,
+    number_in,
+    separator,
+    text_of,
+)
 
 NAMES = {
     "f": "f", "freq": "f", "frequency": "f",
@@ -43,8 +52,6 @@ SI = ("", "m", "n", "m/n", "rad", "n m")  # a unit beside the columns that chang
 WANTED = (
     "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 )
-READ = "CSV, .npz and .mat are read"
-DIGITS = "0123456789+-."
 _PLAIN = ("-", "1", "abs", "linear")  # units of a ratio
 
 
@@ -203,7 +210,7 @@ def _with_stated_unit(
 
 def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     """The columns of a text table, and what of its form is to be reported."""
-    text, notes = _text(path)
+    text, notes = text_of(path)
     lines, comments = list[tuple[int, str]](), list[tuple[int, str]]()
     for i, line in enumerate(text.splitlines(), 1):
         if line.lstrip().startswith(("#", "%")):
@@ -215,14 +222,14 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     if lines[0][1].strip() == "-1" or path.suffix.lower() in (".uff", ".unv"):
         raise UserError(f"{path}: is a universal file; {READ}: write it as one of them")
     last = lines[-1][1]
-    mark = next((mark for mark in "\t;," if mark in last), None)
-    rows = [(i, _cells(line, mark)) for i, line in lines]
-    comma, note = _decimal_comma(path, rows, mark)
+    mark = separator(last)
+    rows = [(i, cells(line, mark)) for i, line in lines]
+    comma, note = decimal_comma(path, rows, mark)
     notes += note
-    numeric = (len(row) > 1 and all(_is_number(cell, comma) for cell in row) for _, row in rows)
+    numeric = (len(row) > 1 and all(is_number(cell, comma) for cell in row) for _, row in rows)
     first = next((k for k, found in enumerate(numeric) if found), None)
     if first is None:
-        bad = next((cell for cell in rows[-1][1] if not _is_number(cell, comma)), last.strip())
+        bad = next((cell for cell in rows[-1][1] if not is_number(cell, comma)), last.strip())
         words = f"is not a table of numbers with a header: {bad!r} in line {rows[-1][0]}"
         raise UserError(f"{path}: {words} is no number; {READ}")
     if first == 0:
@@ -248,7 +255,7 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
             if mark == "," and len(row) == 2 * len(names):
                 words += ": are its decimals commas too? separate the columns by semicolons"
             raise UserError(f"{path}: line {i}: {words}")
-        table.append([_number(path, i, cell, comma) for cell in row])
+        table.append([number_in(path, i, cell, comma) for cell in row])
     numbers = tuple(i for i, _ in rows[first:])
     values = np.array(table)
     parts = [values[:, j] if values[:, j].imag.any() else values[:, j].real
@@ -264,79 +271,6 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
         elif found and means_a_change(found[1]):
             notes.append(f"line {i} is a comment and left out: {found[1]} = {found[2]}")
     return columns, notes
-
-
-def _text(path: Path) -> tuple[str, list[str]]:
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        try:
-            return raw.decode("utf-16"), ["encoded as UTF-16"]
-        except UnicodeDecodeError:
-            raise UserError(f"{path}: is not a table of numbers; {READ}") from None
-    if b"\0" in raw:
-        raise UserError(f"{path}: is not a table of numbers but a binary file; {READ}")
-    try:
-        return raw.decode("utf-8-sig"), []
-    except UnicodeDecodeError:
-        return raw.decode("latin-1"), ["encoded as Latin-1"]
-
-
-def _cells(line: str, mark: str | None) -> list[str]:
-    parts = [part.strip().strip('"').strip() for part in line.split(mark)]
-    while len(parts) > 1 and not parts[-1]:
-        parts.pop()
-    return parts
-
-
-def _decimal_comma(
-    path: Path, rows: Sequence[tuple[int, list[str]]], mark: str | None
-) -> tuple[bool, list[str]]:
-    """Whether its decimals are commas, and what is to be reported of its form."""
-    word = {"\t": "tabs", ";": "semicolons", None: "spaces"}.get(mark, "")
-    notes = [f"separated by {word}"] if word else []
-    if mark == ",":
-        return False, notes
-    cells = [
-        (i, c) for i, row in rows for c in row if c and set(c.casefold()) <= set(DIGITS + ",e")
-    ]
-    with_comma = [(i, c) for i, c in cells if "," in c]
-    if not with_comma:
-        return False, notes
-    both = next((i for i, c in with_comma if "." in c or c.count(",") > 1), None)
-    if both is None and any("." in c for _, c in cells):
-        both = with_comma[0][0]
-    thousands = all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", c) for _, c in with_comma)
-    if both is not None or thousands:
-        words = "a comma may be a decimal or part thousands; write decimals with a point"
-        raise UserError(f"{path}: line {both or with_comma[0][0]}: {words}")
-    return True, [*notes, "decimals by commas"]
-
-
-def _is_number(cell: str, comma: bool) -> bool:
-    try:
-        _parsed(cell, comma)
-    except ValueError:
-        return False
-    return True
-
-
-def _parsed(cell: str, comma: bool) -> complex:
-    cell = cell.replace(",", ".") if comma else cell
-    return complex(re.sub(r"(?<=[\d.])[iI]$", "j", cell.replace(" ", "")))
-
-
-def _number(path: Path, line: int, cell: str, comma: bool) -> complex:
-    try:
-        found = _parsed(cell, comma)
-    except ValueError:
-        raise UserError(f"{path}: line {line}: {cell!r} is not a number") from None
-    if not np.isfinite(found):
-        raise UserError(f"{path}: line {line}: {cell!r} is not a finite number; drop the line")
-    return found
 
 
 def meaning_of(name: str) -> tuple[str, str] | None:
