@@ -181,7 +181,11 @@ def judge_lines(
     if unstable:
         words = f"unstable: {unstable} poles in the right half plane"
         return Judgement(1, {}, False, words, engine=AS_GIVEN)
-    S = np.linalg.norm(np.linalg.inv(np.eye(p) + L[len(below) :]), 2, axis=(1, 2))
+    of_S = np.linalg.inv(np.eye(p) + L[len(below) :])
+    S = np.linalg.norm(of_S, 2, axis=(1, 2))
+    if measured.spread is not None:  # all plants within it: ‖S‖/(1 - ‖KS‖ ‖Δ‖)
+        of_KS = np.linalg.norm(controller.response(HZ * hz) @ of_S, 2, axis=(1, 2))
+        S = S / np.maximum(1.0 - of_KS * measured.unsure[: len(hz)], 1e-12)
     x = np.maximum(HZ * hz, 0.0 if integrator else bounds.omega_low) / bandwidth
     x = x * (1.0 + options.slower)
     room = np.where(x <= 1.0, 1.0 / x, np.inf) if bounds.shape is None else bounds.room(x)

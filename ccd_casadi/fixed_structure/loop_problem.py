@@ -209,7 +209,7 @@ class LoopProblem:
         found[1] = np.linalg.inv(into)[:count]
         return found
 
-    def plants_of(self, constraints: "Constraints") -> np.ndarray:
+    def plants_of(self, constraints: "RowPlaces") -> np.ndarray:
         """The number of the plant that each row is of: several rows of a plant are numbered on."""
         return constraints.plant % self.plants.count
 
