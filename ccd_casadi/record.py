@@ -35,8 +35,8 @@ from ccd_casadi.support.terminal import inform
 def main(options: argparse.Namespace) -> ExitCode:
     """Estimate, print a table, write response.npz, response.csv and response.png."""
     from ccd_casadi.records.findings import findings
-    from ccd_casadi.records.plant_estimate import EstimateOptions, combined, estimate_plant
-    from ccd_casadi.records.time_series import SignalNames, read_record, trimmed
+    from ccd_casadi.records.plant_estimate import EstimateOptions, estimate_plant
+    from ccd_casadi.records.time_series import SignalNames, read_record
     from ccd_casadi.reporting.record_picture import record_picture
     from ccd_casadi.support.text import use_units
     from surrogates.files import write_whole
@@ -50,13 +50,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     records = [read_record(path, names) for path in options.run]
     for path, one in zip(options.run, records, strict=True):
         inform(f"{path.name}: {one.words}", sys.stderr)
-    each = []
-    for path, one in zip(options.run, trimmed(records), strict=True):
-        try:
-            each.append(estimate_plant(one, how))
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from None
-    found = combined(each, how)
+    try:
+        found = estimate_plant(records, how)
+    except UserError as error:
+        raise UserError(f"{options.run[0]}: {error}") from None
     found = replace(found, G=options.gain * found.G, spread=options.gain * found.spread)
     rows = findings(found, records[0].period, how)
     used = found.used

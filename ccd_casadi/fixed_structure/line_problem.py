@@ -124,9 +124,7 @@ class LineProblem(LoopProblem):
             to_kappa[known] = (rate * share)[:, None] * slopes
         return value, to_kappa
 
-    def _lost(
-        self, share: Array, options: SpreadOptions = SpreadOptions()
-    ) -> tuple[Array, Array]:
+    def _lost(self, share: Array, options: SpreadOptions = SpreadOptions()) -> tuple[Array, Array]:
         """-ln ρ with ρ = 1 - share, and its slope to the share."""
         room = 1.0 - share
         held = np.maximum(room, options.least)

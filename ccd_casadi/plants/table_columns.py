@@ -22,25 +22,35 @@ from ccd_casadi.support.text_table import (
 )
 
 NAMES = {
-    "f": "f", "freq": "f", "frequency": "f",
-    "re": "re", "real": "re", "real part": "re",
-    "im": "im", "imag": "im", "imaginary": "im", "imaginary part": "im",
-    "magnitude": "size", "mag": "size", "amplitude": "size",
+    "f": "f", "freq": "f", "frequency": "f", "frequenz": "f", "omega": "f", "ω": "f", "w": "f",
+    "re": "re", "real": "re", "real part": "re", "realteil": "re",
+    "im": "im", "imag": "im", "imaginary": "im", "imaginary part": "im", "imaginärteil": "im",
+    "magnitude": "size", "mag": "size", "amplitude": "size", "betrag": "size", "gain": "size",
+    "receptance": "size", "mobility": "size", "accelerance": "size", "inertance": "size",
     "phase": "angle", "angle": "angle",
     "g": "G", "response": "G",
-    "spread": "spread", "coherence": "coherence",
+    "spread": "spread", "coherence": "coherence", "kohärenz": "coherence",
+    "averages": "averages", "number of averages": "averages",
 }  # fmt: skip
 COMPLIANCE = {  # by the casefolded unit, in which both signs of micro are one
     "": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "\N{GREEK SMALL LETTER MU}m/n": 1e-6,
     "nm/n": 1e-9, "rad/(n m)": 1.0, "rad/n m": 1.0, "rad/nm": 1.0,
 }  # fmt: skip
+RATES = {  # units of a velocity or an acceleration over a force: the order of the derivative
+    "m/s/n": 1, "(m/s)/n": 1, "m/(n s)": 1, "m/(s n)": 1,
+    "m/s^2/n": 2, "(m/s^2)/n": 2, "m/s²/n": 2, "(m/s²)/n": 2, "m/s2/n": 2, "1/kg": 2,
+}  # fmt: skip
+RATE_NAMES = {"mobility": 1, "accelerance": 2, "inertance": 2}
+RATE_WORDS = {1: "a mobility, divided by j 2π f", 2: "an accelerance, divided by -(2π f)²"}
+ANGULAR = ("omega", "ω", "w")  # in rad/s where no unit is named
+OF_RESPONSE = COMPLIANCE | dict.fromkeys(RATES, 1.0)
 UNITS = {
     "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
-    "size": COMPLIANCE | {"db": -1.0},  # a size in decibels
+    "size": OF_RESPONSE | {"db": -1.0},  # a size in decibels
     "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
     | dict.fromkeys(("rad", "radian", "radians"), 1.0),
-    "re": COMPLIANCE, "im": COMPLIANCE, "G": COMPLIANCE, "spread": COMPLIANCE,
-    "coherence": {"": 1.0},
+    "re": OF_RESPONSE, "im": OF_RESPONSE, "G": OF_RESPONSE, "spread": COMPLIANCE,
+    "coherence": {"": 1.0}, "averages": {"": 1.0},
 }  # fmt: skip
 AS_WRITTEN = {"f": "Hz or rad/s", "angle": "deg or rad", "size": "m/N, mm/N, µm/N, nm/N or dB"}
 MEGA = re.compile(r"(?<![A-Za-z])M[mM]\s*/")  # as a prefix M is mega, never milli
@@ -232,6 +242,11 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
         bad = next((cell for cell in rows[-1][1] if not is_number(cell, comma)), last.strip())
         words = f"is not a table of numbers with a header: {bad!r} in line {rows[-1][0]}"
         raise UserError(f"{path}: {words} is no number; {READ}")
+    above = [(i, line.lstrip(" #%")) for i, line in comments if i < rows[0][0]]
+    if first == 0 and above and len(cells(above[-1][1], mark)) == len(rows[0][1]):
+        rows, first = [(above[-1][0], cells(above[-1][1], mark)), *rows], 1
+        comments = [item for item in comments if item[0] != above[-1][0]]
+        notes.append(f"line {above[-1][0]} is the header")
     if first == 0:
         raise UserError(f"{path}: line {rows[0][0]}: has no header above it; name {WANTED}")
     at = first - 1
@@ -252,7 +267,7 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     for i, row in rows[first:]:
         if len(row) != len(names):
             words = f"has {len(row)} cells and the header {len(names)}"
-            if mark == "," and len(row) == 2 * len(names):
+            if mark == "," and len(row) > len(names):
                 words += ": are its decimals commas too? separate the columns by semicolons"
             raise UserError(f"{path}: line {i}: {words}")
         table.append([number_in(path, i, cell, comma) for cell in row])
@@ -278,7 +293,11 @@ def meaning_of(name: str) -> tuple[str, str] | None:
     name = " ".join(name.replace("_", " ").split()).casefold()
     if name == "hz":
         return "f", "hz"
-    if name in NAMES:
+    if name in ("db", "deg"):
+        return ("size" if name == "db" else "angle"), name
+    if name in ANGULAR:
+        return "f", "rad/s"
+    if name in NAMES and name != "gain":  # which may be a factor
         return NAMES[name], ""
     bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", name)
     base, unit = bracket.groups() if bracket else name.split(" ", 1) if " " in name else (name, "")
@@ -286,6 +305,32 @@ def meaning_of(name: str) -> tuple[str, str] | None:
         return None
     unit = "" if bracket and unit in _PLAIN else unit
     return NAMES[base], unit
+
+
+def rate_order(path: Path, name: str) -> int:
+    """Find of which derivative of a displacement a column of a response is.
+
+    Parameters
+    ----------
+    path, name : Path, str
+
+    Returns
+    -------
+    int
+        0: receptance, 1: mobility, 2: accelerance, by its name or its unit.
+
+    Raises
+    ------
+    UserError
+        Its name and its unit differ.
+    """
+    base = re.split(r"[ _(\[]", name.strip().casefold())[0]
+    found = meaning_of(name)
+    unit = found[1] if found else ""
+    named, stated = RATE_NAMES.get(base), RATES.get(unit)
+    if named is not None and unit not in ("", "db") and stated != named:
+        raise UserError(f"{path}: {name!r}: a {base} is not in {unit}; name what it is")
+    return named or stated or 0
 
 
 def _with_unit(path: Path, place: str, name: str, unit: str) -> str:

@@ -93,8 +93,8 @@ def fit_locally(
 
     Parameters
     ----------
-    Z, R : array (q, K), array (K,)
-        Spectra of the signals and of the excitation, line 0 first.
+    Z, R : array (M, q, K), array (M, K)
+        Spectra of the signals and of the excitation in M records, line 0 first; G is one for all.
     lines : int array (k,)
         Where the responses are wanted.
     period_lines : int
@@ -108,7 +108,7 @@ def fit_locally(
     """
     if period_lines > 1:
         return _periodic(Z, R, lines, period_lines, options)
-    widths = [n for n in options.half_widths if 2 * n + 1 <= R.size - 1]
+    widths = [n for n in options.half_widths if 2 * n + 1 <= R.shape[1] - 1]
     parts = [_widest(Z, R, part, widths, options) for part in _blocks(lines, options.at_once)]
     return LocalFit(*(np.concatenate(own) for own in zip(*parts, strict=True)))
 
@@ -127,7 +127,7 @@ def _widest(
     """At each line the fit in the widest window that agrees with all narrower ones."""
     fits = []
     for n in widths:
-        first = np.clip(lines - n, 1, R.size - 2 * n - 1)
+        first = np.clip(lines - n, 1, R.shape[1] - 2 * n - 1)
         window = first[:, None] + np.arange(2 * n + 1)
         fits.append(_solved(Z, R, lines, window, n, options.order, options.transient_order,
                             options.conditioned))  # fmt: skip
@@ -154,22 +154,18 @@ def _periodic(
 ) -> LocalFit:
     """G = (Z - T)/R at an excited line, T and the noise from the lines without excitation beside
     it."""
-    beside, reach = np.array([m for m in range(1, 4 * options.periodic_lines)
-                              if m % period_lines][: options.periodic_lines // 2]), 0  # fmt: skip
-    reach = int(beside[-1])
-    offsets = np.concatenate([-beside[::-1], [0], beside])
-    inside = (lines - reach >= 1) & (lines + reach < R.size)
-    lines = lines[inside]
+    every = np.arange(1, R.shape[1])
+    quiet = every[every % period_lines > 0]
+    count = min(options.periodic_lines, len(quiet))
+    start = np.clip(np.searchsorted(quiet, lines) - count // 2, 0, len(quiet) - count)
+    window = np.hstack([lines[:, None], quiet[start[:, None] + np.arange(count)]])
+    reach = int(np.abs(window - lines[:, None]).max())
+    blocks = _blocks(np.arange(len(lines)), options.at_once)
     parts = [
-        _solved(Z, R, part, part[:, None] + offsets, reach, 0, options.transient_order,
-                options.conditioned)
-        for part in _blocks(lines, options.at_once)
-    ]  # fmt: skip
-    found = [np.concatenate(own) for own in zip(*parts, strict=True)]
-    whole = [np.full((len(inside), *part.shape[1:]), np.nan, part.dtype) for part in found]
-    for room, part in zip(whole, found, strict=True):
-        room[inside] = part
-    return LocalFit(*whole)
+        _solved(Z, R, lines[at], window[at], reach, 0, options.transient_order, options.conditioned)
+        for at in blocks
+    ]
+    return LocalFit(*(np.concatenate(own) for own in zip(*parts, strict=True)))
 
 
 def _solved(
@@ -178,28 +174,32 @@ def _solved(
 ) -> Parts:  # fmt: skip
     """Least squares in each window (k, w) about its line, by orthogonal factors."""
     m = (window - lines[:, None]) / n
-    excited = R[window]
-    scale = np.sqrt((np.abs(excited) ** 2).mean(axis=1))
+    basis = np.linalg.qr(m[..., None] ** np.arange(transient_order + 1)).Q  # of T, in each record
+
+    def without_T(own: np.ndarray) -> np.ndarray:
+        return np.asarray(own - basis[None] @ (basis.swapaxes(1, 2)[None] @ own))
+
+    excited = R[:, window]
+    scale = np.sqrt((np.abs(excited) ** 2).mean(axis=(0, 2)))
     scale = np.where(scale > 0.0, scale, 1.0)
     of_G = (excited / scale[:, None])[..., None] * m[..., None] ** np.arange(order + 1)
-    of_T = m[..., None] ** np.arange(transient_order + 1)
-    # T first: what is left of the columns of G is then what T cannot explain.
-    A = np.concatenate([of_T.astype(complex), of_G], axis=2)
-    columns, at = A.shape[2], of_T.shape[2]
+    signals = Z[:, :, window].transpose(0, 2, 3, 1)
+    kept = without_T(signals)
+    by_T = (np.abs(signals) ** 2).sum(axis=(0, 2)) - (np.abs(kept) ** 2).sum(axis=(0, 2))
+    A, kept = (np.concatenate(list(own), axis=1) for own in (without_T(of_G), kept))
     Q, upper = np.linalg.qr(A)
+    columns = order + 1
     diagonal = np.abs(np.einsum("kii->ki", upper))
-    bad = diagonal.min(axis=1) < conditioned * diagonal.max(axis=1)
+    bad = diagonal.min(axis=1) < conditioned * np.sqrt(A.shape[1])
     upper = np.where(bad[:, None, None], np.eye(columns), upper)
     inverse = np.linalg.inv(upper)
-    signals = Z[:, window].transpose(1, 2, 0)
-    of_Q = Q.conj().swapaxes(1, 2) @ signals
-    rest = signals - Q @ of_Q
-    degrees = window.shape[1] - columns
+    of_Q = Q.conj().swapaxes(1, 2) @ kept
+    rest = kept - Q @ of_Q
+    degrees = A.shape[1] - columns - len(R) * (transient_order + 1)
     noise = (rest.swapaxes(1, 2) @ rest.conj()) / degrees
-    G = (inverse[:, at, :][:, None, :] @ of_Q)[:, 0, :] / scale[:, None]
-    gain = (np.abs(inverse[:, at, :]) ** 2).sum(axis=1) / scale**2
-    explained = (np.abs(of_Q[:, at:]) ** 2).sum(axis=1)
-    by_T = (np.abs(of_Q[:, :at]) ** 2).sum(axis=1)
+    G = (inverse[:, :1, :] @ of_Q)[:, 0, :] / scale[:, None]
+    gain = (np.abs(inverse[:, 0, :]) ** 2).sum(axis=1) / scale**2
+    explained = (np.abs(of_Q) ** 2).sum(axis=1)
     left = (np.abs(rest) ** 2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         coherence = np.where(explained > 0.0, explained / (explained + left), 0.0)

@@ -17,7 +17,6 @@ the stated probability, at each line alone.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -47,6 +46,8 @@ class EstimateOptions:
         Relative distance of the lines that are kept; all of them where the record has fewer.
     least_samples : int
         Of a record.
+    same_rate : float
+        Relative difference of the rates of records, at most.
     repeats : float
         Relative difference of an excitation and itself one period later, at most.
     most_periods : int
@@ -63,6 +64,7 @@ class EstimateOptions:
     around: int = 31
     apart: float = 2e-3
     least_samples: int = 256
+    same_rate: float = 1e-3
     repeats: float = 1e-6
     most_periods: int = 64
     through: float = 0.5
@@ -124,16 +126,17 @@ class PlantEstimate:
 
 
 def estimate_plant(
-    series: TimeSeries,
+    series: TimeSeries | Sequence[TimeSeries],
     options: EstimateOptions = EstimateOptions(),
     windows: WindowOptions = WindowOptions(),
 ) -> PlantEstimate:
-    """Estimate the plant's response from a record.
+    """Estimate the plant's response from records.
 
     Parameters
     ----------
-    series : TimeSeries
-        In open loop its excitation is its force.
+    series : TimeSeries or sequence of them
+        Of one plant, in open loop with the force as the excitation; several are cut to the length
+        of the shortest. Where they differ, as with another amplitude, the spread is wider.
     options, windows : EstimateOptions, WindowOptions
 
     Returns
@@ -143,33 +146,40 @@ def estimate_plant(
     Raises
     ------
     UserError
-        The record is too short, or nothing excites the plant.
+        A record is too short, nothing excites the plant, or rates or periods differ.
     """
-    signals = np.stack([series.position, series.force, series.excitation]).astype(float)
-    if not np.ptp(signals[2]) > 0.0:
-        raise UserError("the excitation is constant, so nothing moves the plant; name another "
-                        "column (--injected, --reference)")  # fmt: skip
-    for name, own in (("force", signals[1]), ("position", signals[0])):
-        if not np.ptp(own) > 0.0:
-            raise UserError(f"the {name} is constant; name another column (--{name})")
-    period = _period(signals[2], options)
+    records = [series] if isinstance(series, TimeSeries) else list(series)
+    step = records[0].period
+    for one in records:
+        _require_alive(one)
+        if abs(one.period / step - 1.0) > options.same_rate:
+            rates = f"{1.0 / step:.6g} and {1.0 / one.period:.6g} Hz"
+            raise UserError(f"the records have {rates}; give records of one rate")
+    shortest = min(len(one.force) for one in records)
+    signals = np.array([(one.position[:shortest], one.force[:shortest], one.excitation[:shortest])
+                        for one in records], float)  # fmt: skip
     periods = 1
-    if period:
-        begin = int(np.argmax(np.abs(np.diff(signals[2])) > 0.0))
-        periods = min((signals.shape[1] - 1 - begin) // period, options.most_periods)
-        signals = signals[:, signals.shape[1] - 1 - periods * period :]
-    if signals.shape[1] < options.least_samples:
-        words = f"has {signals.shape[1]} samples; a response needs {options.least_samples} or more"
+    every = {_period(one[2], options) for one in signals}
+    if every != {0}:
+        if len(every) > 1:
+            raise UserError("the excitations of the records repeat after different times, or one "
+                            "does not; give records of one excitation")  # fmt: skip
+        period, last = every.pop(), shortest - 1
+        begin = max(int(np.argmax(np.abs(np.diff(one[2])) > 0.0)) for one in signals)
+        periods = min((last - begin) // period, options.most_periods)
+        signals = signals[:, :, last - periods * period :]
+    count = signals.shape[2]
+    if count < options.least_samples:
+        words = f"has {count} samples; a response needs {options.least_samples} or more"
         raise UserError(f"the record {words}")
-    ends = max(1, signals.shape[1] // 50)
-    offset = abs(signals[0, -ends:].mean() - signals[0, :ends].mean())
-    drift = offset / float(np.ptp(signals[0]))
-    changes = np.diff(signals, axis=1)
-    size = changes.shape[1]
-    spectra = np.fft.rfft(changes, axis=1) / np.sqrt(size)
-    resolution = 1.0 / (size * series.period)
-    lines = _kept(spectra.shape[1], periods, options)
-    fit = fit_locally(spectra[:2], spectra[2], lines, periods, windows)
+    ends, positions = max(1, count // 50), signals[:, 0]
+    offset = np.abs(positions[:, -ends:].mean(axis=1) - positions[:, :ends].mean(axis=1))
+    drift = float((offset / np.ptp(positions, axis=1)).max())
+    changes = np.diff(signals, axis=2)
+    spectra = np.fft.rfft(changes, axis=2) / np.sqrt(count - 1)
+    resolution = 1.0 / ((count - 1) * step)
+    lines = _kept(spectra.shape[2], periods, options)
+    fit = fit_locally(spectra[:, :2], spectra[:, 2], lines, periods, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         G = fit.G[:, 0] / fit.G[:, 1]
         side = np.stack([np.ones_like(G), -G], axis=1)
@@ -193,45 +203,14 @@ def estimate_plant(
                          drift)  # fmt: skip
 
 
-def combined(each: Sequence[PlantEstimate], options: EstimateOptions) -> PlantEstimate:
-    """Combine the estimates of records of equal length and rate.
-
-        G = sum(G_i/s_i^2)/sum(1/s_i^2),   1/s^2 = sum(1/s_i^2)/max(1, chi^2)
-
-    with s_i the spreads: where records differ by more than these, as with another amplitude, the
-    spread is wider by chi, the root of the mean of |G_i - G|^2/s_i^2 over the degrees of freedom.
-
-    Parameters
-    ----------
-    each : sequence of PlantEstimate
-    options : EstimateOptions
-
-    Returns
-    -------
-    PlantEstimate
-        On the lines that all have.
-    """
-    if len(each) == 1:
-        return each[0]
-    first = each[0]
-    lines = [np.round(one.hz / one.resolution).astype(int) for one in each]
-    shared = reduce(np.intersect1d, lines)
-    if not len(shared):
-        raise UserError("the records have no line in common; give records of one excitation")
-    parts = [one.only(np.searchsorted(own, shared)) for one, own in zip(each, lines, strict=True)]
-    weights = np.array([1.0 / np.maximum(one.spread, 1e-12 * np.abs(one.G)) ** 2 for one in parts])
-    G = sum(w * one.G for w, one in zip(weights, parts, strict=True)) / weights.sum(axis=0)
-    apart = np.array([np.abs(one.G - G) ** 2 for one in parts])
-    quantile = -np.log(1.0 - options.confidence)  # of |error|^2 over its mean
-    chi = quantile * (weights * apart).sum(axis=0) / (len(parts) - 1)
-    spread = np.sqrt(np.maximum(chi, 1.0) / weights.sum(axis=0))
-    return replace(
-        parts[0], G=G, spread=spread, weak=spread > options.weak * np.abs(G),
-        coherence=np.mean([one.coherence for one in parts], axis=0),
-        leakage=np.max([one.leakage for one in parts], axis=0),
-        drift=max(one.drift for one in parts), through=min(one.through for one in each),
-        resolution=first.resolution,
-    )  # fmt: skip
+def _require_alive(series: TimeSeries) -> None:
+    """Raise UserError where a signal is constant."""
+    if not np.ptp(series.excitation) > 0.0:
+        raise UserError("the excitation is constant, so nothing moves the plant; name another "
+                        "column (--injected, --reference)")  # fmt: skip
+    for name in ("force", "position"):
+        if not np.ptp(getattr(series, name)) > 0.0:
+            raise UserError(f"the {name} is constant; name another column (--{name})")
 
 
 def _kept(count: int, periods: int, options: EstimateOptions) -> np.ndarray:

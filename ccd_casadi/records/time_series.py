@@ -1,7 +1,6 @@
 """Records of a loop: excitation, force and position over time, read from files of logs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -142,32 +141,6 @@ def read_record(path: Path, names: SignalNames = SignalNames()) -> TimeSeries:
     words = "; ".join([f"{len(drive)} samples at {1.0 / period:.6g} Hz", loop, *reversed(units),
                        *timing, *notes])  # fmt: skip
     return TimeSeries(period, drive, scaled[1], scaled[0], injected, words)
-
-
-def trimmed(records: Sequence[TimeSeries]) -> list[TimeSeries]:
-    """Cut records to the length of the shortest.
-
-    Parameters
-    ----------
-    records : sequence of TimeSeries
-
-    Returns
-    -------
-    list of TimeSeries
-
-    Raises
-    ------
-    UserError
-        Their rates differ.
-    """
-    first, shortest = records[0], min(len(one.force) for one in records)
-    for one in records:
-        if abs(one.period / first.period - 1.0) > SamplingOptions.jitter:
-            raise UserError(f"the records have {1.0 / first.period:.6g} and {1.0 / one.period:.6g} "
-                            "Hz; give records of one rate")  # fmt: skip
-    return [replace(one, **{name: getattr(one, name)[:shortest]
-                            for name in ("excitation", "force", "position")})
-            for one in records]  # fmt: skip
 
 
 def _column(path: Path, columns: Columns, role: str, stated: str | None) -> str:
