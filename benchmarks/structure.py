@@ -56,7 +56,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.plants.cad.elastic_body": ("AXES", "OUTWARD"),
     "ccd_casadi.plants.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
     "ccd_casadi.plants.rigid_modes": ("EPS",),
-    "ccd_casadi.plants.table_columns": ("COMPLIANCE",),
+    "ccd_casadi.plants.table_columns": ("COMPLIANCE", "RATES", "RATE_NAMES"),
     "ccd_casadi.records.signal_names": ("UNITS",),
     "ccd_casadi.sampling.store": ("SCHEMA",),
     "ccd_casadi.studies.backends": ("BISECT", "SUBOPTIMAL"),

@@ -25,6 +25,7 @@ from ccd_casadi.plants.table_columns import (
     npz_arrays,
     rate_order,
 )
+from ccd_casadi.plants.universal_file import SUFFIXES, columns_of_universal
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
@@ -77,7 +78,7 @@ class ResponseTable:
 
 
 def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> ResponseTable:
-    """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
+    """The response in a file of any kind. Raises UserError that names what is not clear."""
     suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
         content = npz_arrays(path)
@@ -88,6 +89,8 @@ def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> Res
     elif suffix == ".mat":
         content = mat_variables(path)
         columns = columns_of_arrays(path, lines_in(content) or content)
+    elif suffix in SUFFIXES:
+        columns, notes = columns_of_universal(path)
     else:
         columns, notes = columns_of_csv(path)
     return _understood(path, columns, notes, options)

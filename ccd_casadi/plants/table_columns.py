@@ -229,8 +229,8 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
             lines.append((i, line))
     if not lines:
         raise UserError(f"{path}: is empty; it needs a header and lines of numbers")
-    if lines[0][1].strip() == "-1" or path.suffix.lower() in (".uff", ".unv"):
-        raise UserError(f"{path}: is a universal file; {READ}: write it as one of them")
+    if lines[0][1].strip() == "-1":
+        raise UserError(f"{path}: is a universal file; name it {path.stem}.uff")
     last = lines[-1][1]
     mark = separator(last)
     rows = [(i, cells(line, mark)) for i, line in lines]
@@ -301,7 +301,7 @@ def meaning_of(name: str) -> tuple[str, str] | None:
         return NAMES[name], ""
     bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", name)
     base, unit = bracket.groups() if bracket else name.split(" ", 1) if " " in name else (name, "")
-    if base not in NAMES:
+    if base not in NAMES or (base == "gain" and not unit):
         return None
     unit = "" if bracket and unit in _PLAIN else unit
     return NAMES[base], unit
