@@ -43,7 +43,7 @@ class SpreadOptions:
     Attributes
     ----------
     least : float
-        ρ below which -ln ρ goes on straight: a start may have plants that reach -1.
+        ρ below which -ln ρ continues straight: a start may have plants that reach -1.
     """
 
     least: float = 0.05

@@ -28,7 +28,7 @@ NAMES = {
     "magnitude": "size", "mag": "size", "amplitude": "size", "betrag": "size", "gain": "size",
     "receptance": "size", "mobility": "size", "accelerance": "size", "inertance": "size",
     "phase": "angle", "angle": "angle",
-    "g": "G", "response": "G",
+    "g": "G", "response": "G", "responsedata": "G",  # of MATLAB's frd
     "spread": "spread", "coherence": "coherence", "kohärenz": "coherence",
     "averages": "averages", "number of averages": "averages",
 }  # fmt: skip
@@ -45,7 +45,8 @@ RATE_WORDS = {1: "a mobility, divided by j 2π f", 2: "an accelerance, divided b
 ANGULAR = ("omega", "ω", "w")  # in rad/s where no unit is named
 OF_RESPONSE = COMPLIANCE | dict.fromkeys(RATES, 1.0)
 UNITS = {
-    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
+    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ,
+          "rad/timeunit": 1.0 / HZ},  # of MATLAB; other time units are refused
     "size": OF_RESPONSE | {"db": -1.0},  # a size in decibels
     "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
     | dict.fromkeys(("rad", "radian", "radians"), 1.0),
@@ -58,7 +59,7 @@ COMMENT = re.compile(r"\s*[#%]+\s*(\w[\w ]*?)\s*[:=]\s*(.*\S)")  # a name and it
 CHANGES = frozenset({"gain", "gains", "scale", "scaling", "factor", "delay", "delays", "lag",
                      "latency", "deadtime", "rate", "period", "dt", "fs", "ts"})  # fmt: skip
 UNIT_NAME = re.compile(r"(?:(.*?)[ _]*units?|units?[ _]+(?:of[ _]+)?(.*))", re.IGNORECASE)
-SI = ("", "m", "n", "m/n", "rad", "n m")  # a unit beside the columns that changes none of them
+SI = ("", "m", "n", "m/n", "rad", "n m", "seconds")  # a unit beside the columns that changes none of them
 WANTED = (
     "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 )

@@ -64,7 +64,7 @@ def read_columns(path: Path) -> tuple[Columns, float | None, list[str]]:
             columns[name] = numbers.ravel().astype(float)
         else:
             raise UserError(f"{path}: {name}: {numbers.shape} is not one signal; give each signal "
-                            "as an array of its own")  # fmt: skip
+                            "as its own array")  # fmt: skip
     if not columns:
         raise UserError(f"{path}: holds no signals; give t, the excitation, the force and position")
     lengths = {len(values) for values in columns.values()}

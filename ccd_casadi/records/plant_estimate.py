@@ -192,7 +192,7 @@ def estimate_plant(
     hz, G, spread = resolution * lines[known], G[known], spread[known]
     coherence = fit.coherence[known].min(axis=1)
     if not len(hz):
-        raise UserError("no line of the record is excited enough to tell the plant from noise; "
+        raise UserError("no line of the record is excited enough to part the plant from noise; "
                         "inject more force, or for longer")  # fmt: skip
     weak = spread > options.weak * np.abs(G)
     good = np.flatnonzero(~weak)

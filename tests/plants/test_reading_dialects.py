@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from ccd_casadi.plants.measured import read_frequency_response
 from ccd_casadi.support.errors import UserError
@@ -129,3 +130,22 @@ def test_universal_files(tmp_path: Path) -> None:
     (tmp_path / "b.uff").write_text("    -1\n    58\nhello\n    -1\n")
     with pytest.raises(UserError):
         read_frequency_response(tmp_path / "b.uff")
+
+
+def test_the_struct_of_an_frd(tmp_path: Path) -> None:
+    """As MATLAB's get(frd) has it: (outputs, inputs, lines) over rad/s."""
+    both = np.moveaxis(G[:, None, None] * np.array([[1.0, 0.2], [0.1, 0.9]]), 0, -1)
+    empty = np.array([], object)
+    struct = {
+        "ResponseData": both, "Frequency": 2.0 * np.pi * F, "FrequencyUnit": "rad/TimeUnit", "Ts": 0.0,
+        "IODelay": np.zeros((2, 2)), "InputDelay": np.zeros((2, 1)), "TimeUnit": "seconds",
+        "OutputDelay": np.zeros((2, 1)), "Name": "", "Notes": empty, "UserData": empty,
+    }  # fmt: skip
+    savemat(tmp_path / "sys.mat", {"sys": struct})
+    found = read_frequency_response(tmp_path / "sys.mat")
+    np.testing.assert_allclose(found.hz, F)
+    np.testing.assert_allclose(found.G, np.moveaxis(both, -1, 0))
+    late = struct | {"IODelay": 1e-3 * np.ones((2, 2))}
+    savemat(tmp_path / "late.mat", {"sys": late})
+    with pytest.raises(UserError, match="IODelay"):
+        read_frequency_response(tmp_path / "late.mat")
