@@ -45,8 +45,7 @@ RATE_WORDS = {1: "a mobility, divided by j 2π f", 2: "an accelerance, divided b
 ANGULAR = ("omega", "ω", "w")  # in rad/s where no unit is named
 OF_RESPONSE = COMPLIANCE | dict.fromkeys(RATES, 1.0)
 UNITS = {
-    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ,
-          "rad/timeunit": 1.0 / HZ},  # of MATLAB; other time units are refused
+    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ, "rad/timeunit": 1.0 / HZ},
     "size": OF_RESPONSE | {"db": -1.0},  # a size in decibels
     "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
     | dict.fromkeys(("rad", "radian", "radians"), 1.0),
@@ -59,7 +58,7 @@ COMMENT = re.compile(r"\s*[#%]+\s*(\w[\w ]*?)\s*[:=]\s*(.*\S)")  # a name and it
 CHANGES = frozenset({"gain", "gains", "scale", "scaling", "factor", "delay", "delays", "lag",
                      "latency", "deadtime", "rate", "period", "dt", "fs", "ts"})  # fmt: skip
 UNIT_NAME = re.compile(r"(?:(.*?)[ _]*units?|units?[ _]+(?:of[ _]+)?(.*))", re.IGNORECASE)
-SI = ("", "m", "n", "m/n", "rad", "n m", "seconds")  # a unit beside the columns that changes none of them
+SI = ("", "m", "n", "m/n", "rad", "n m", "seconds")  # units that change no column
 WANTED = (
     "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 )
@@ -72,7 +71,7 @@ def npz_arrays(path: Path) -> dict[str, np.ndarray]:
             return dict(file)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or described(error)
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
+        raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
 @dataclass(frozen=True)

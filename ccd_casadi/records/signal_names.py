@@ -151,4 +151,5 @@ def factor_of(path: Path, role: str, name: str) -> tuple[float, str]:
     if unit not in known:
         raise UserError(f"{path}: {name!r}: the unit {unit!r} is not one of a {role}; it may be "
                         f"{', '.join(known)}")  # fmt: skip
-    return known[unit], unit
+    written = re.search(re.escape(unit), name, re.IGNORECASE)
+    return known[unit], written[0] if written else unit

@@ -137,7 +137,8 @@ def test_the_struct_of_an_frd(tmp_path: Path) -> None:
     both = np.moveaxis(G[:, None, None] * np.array([[1.0, 0.2], [0.1, 0.9]]), 0, -1)
     empty = np.array([], object)
     struct = {
-        "ResponseData": both, "Frequency": 2.0 * np.pi * F, "FrequencyUnit": "rad/TimeUnit", "Ts": 0.0,
+        "ResponseData": both, "Frequency": 2.0 * np.pi * F, "FrequencyUnit": "rad/TimeUnit",
+        "Ts": 0.0,
         "IODelay": np.zeros((2, 2)), "InputDelay": np.zeros((2, 1)), "TimeUnit": "seconds",
         "OutputDelay": np.zeros((2, 1)), "Name": "", "Notes": empty, "UserData": empty,
     }  # fmt: skip
