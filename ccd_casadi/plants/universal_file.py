@@ -19,13 +19,15 @@ class DatasetCodes:
 
     Attributes
     ----------
-    response_function, frequency, force : int
-        Function type of an FRF; specific data types of an abscissa in Hz and of a force.
+    response_function, frequency, force, SI : int
+        Function type of an FRF; specific data types of an abscissa in Hz and of a force; code of
+        dataset 164.
     """
 
     response_function: int = 4
     frequency: int = 18
     force: int = 13
+    SI: int = 1
 
 
 # by the specific data type of the ordinate: what it is, and units of it over N by label
@@ -34,6 +36,8 @@ ORDINATES: Mapping[int, tuple[str, Mapping[str, str]]] = {
     11: ("velocity", {"": "m/s/N", "m/s": "m/s/N"}),
     12: ("acceleration", dict.fromkeys(("", "m/s^2", "m/s2", "m/s²", "m/s**2"), "m/s^2/N")),
 }  # fmt: skip
+FUNCTIONS = {1: "time responses", 2: "auto spectra", 3: "cross spectra", 6: "coherences",
+             9: "power spectral densities"}  # fmt: skip
 
 
 def columns_of_universal(
@@ -62,36 +66,46 @@ def columns_of_universal(
         raise UserError(f"{path}: cannot be read: no such file")
     try:
         file = pyuff.UFF(str(path))
-        at = [i for i, kind in enumerate(file.get_set_types()) if int(kind) == 58]
+        kinds = [int(kind) for kind in file.get_set_types()]
+        at = [i for i, kind in enumerate(kinds) if kind == 58]
         sets = [file.read_sets(i) for i in at]
+        units = [file.read_sets(i) for i, kind in enumerate(kinds) if kind == 164]
     except Exception as error:  # a damaged file fails anywhere inside the reader
         raise UserError(f"{path}: is not a readable universal file: {described(error)}") from None
     found = [one for one in sets if int(one["func_type"]) == codes.response_function]
     if len(found) != 1:
-        each = ", ".join(_place(one) for one in found[:4]) or "none"
-        words = f"holds {len(found)} frequency responses of dataset 58 ({each})"
+        other = [FUNCTIONS.get(int(one["func_type"]), "other functions") for one in sets]
+        other += [f"dataset {kind}" for kind in kinds if kind != 58]
+        each = [_place(one) for one in found[:4]] or list(dict.fromkeys(other))[:6]
+        words = f"holds {len(found)} frequency responses of dataset 58 ({', '.join(each)})"
         raise UserError(f"{path}: {words}; write one a file")
     one, notes = found[0], [_place(found[0])]
+    foreign = next((item for item in units if int(item["units_code"]) != codes.SI), None)
+    if foreign is not None:
+        named = str(foreign.get("units_description", "")).strip() or foreign["units_code"]
+        words = f"dataset 164 has the units {named}, and the response may be in these or in SI"
+        raise UserError(f"{path}: {words}; write it in SI")
     if int(one["abscissa_spec_data_type"]) != codes.frequency:
         raise UserError(f"{path}: its abscissa is not a frequency; write a response over Hz")
     over, force = int(one["orddenom_spec_data_type"]), _label(one, "orddenom")
     kind, unit = int(one["ordinate_spec_data_type"]), _label(one, "ordinate")
     if over != codes.force or force not in ("", "n"):
-        words = f"is over {force or f'data type {over}'}, not over a force in N"
+        what = force or (f"data type {over}" if over else "what its header does not name")
+        words = f"is over {what}, not over a force in N"
         raise UserError(f"{path}: {words}; write it over N")
     if kind not in ORDINATES:
         raise UserError(f"{path}: its data type {kind} is not a displacement, velocity or "
                         "acceleration; write one of them")  # fmt: skip
-    name, units = ORDINATES[kind]
-    if unit not in units:
+    name, known = ORDINATES[kind]
+    if unit not in known:
         raise UserError(f"{path}: {unit!r} is not understood as a unit of {name}; it may be "
-                        f"{', '.join(key for key in units if key)}")  # fmt: skip
+                        f"{', '.join(key for key in known if key)}")  # fmt: skip
     if not unit:
         notes.append(f"{name} in SI, as no unit is named")
     if len(sets) > 1:
         notes.append(f"{len(sets) - 1} other functions are left out")
     G, hz = np.asarray(one["data"], complex), np.asarray(one["x"], float)
-    return [TableColumn("f_hz", hz), TableColumn(f"G ({units[unit]})", G)], notes
+    return [TableColumn("f_hz", hz), TableColumn(f"G ({known[unit]})", G)], notes
 
 
 def _label(one: Mapping[str, Any], of: str) -> str:

@@ -123,7 +123,14 @@ def test_universal_files(tmp_path: Path) -> None:
         pyuff.UFF(str(path)).write_sets(one | change, "overwrite")
         with pytest.raises(UserError, match=words):
             read_frequency_response(path)
-    pyuff.UFF(str(path)).write_sets(one, "add")
+    inches = {
+        "type": 164, "units_code": 7, "units_description": "IN", "temp_mode": 1, "length": 39.37,
+        "force": 0.2248, "temp": 1.0, "temp_offset": 273.15,
+    }  # fmt: skip
+    pyuff.UFF(str(path)).write_sets([inches, one], "overwrite")
+    with pytest.raises(UserError, match="the units IN.*may be in these or in SI"):
+        read_frequency_response(path)
+    pyuff.UFF(str(path)).write_sets(one, "overwrite")
     pyuff.UFF(str(path)).write_sets(one, "add")
     with pytest.raises(UserError, match="holds 2 frequency responses"):
         read_frequency_response(path)

@@ -111,10 +111,11 @@ def test_the_present_controller_is_judged_beside_the_new_one(
     S = np.abs(1.0 / (1.0 + measured.G * controller_response(K, measured.hz, 1 / RATE)[:, 0, 0]))
     assert now.stable
     assert now.peak == pytest.approx(S.max())
-    assert measured.hz[np.argmax(np.sqrt(0.5) < S)] == pytest.approx(now.bandwidth_hz, rel=0.02)
+    assert measured.hz[np.argmax(np.sqrt(0.5) < S)] == pytest.approx(now.bandwidth_hz, rel=0.04)
     np.savez(tmp_path / "G.npz", f_hz=measured.hz, G=measured.G)
     words = [str(tmp_path / "G.npz"), "--rate-hz", "5000", "--out", str(tmp_path / "out")]
-    words += ["--biquads", "0", "--least-damping", "0.02", "--controller", str(tmp_path / "now.json")]
+    words += ["--biquads", "0", "--least-damping", "0.02"]
+    words += ["--controller", str(tmp_path / "now.json")]
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert f"now {now.bandwidth_hz:.4g} Hz" in " ".join(printed.split())
