@@ -128,7 +128,7 @@ def test_universal_files(tmp_path: Path) -> None:
         "force": 0.2248, "temp": 1.0, "temp_offset": 273.15,
     }  # fmt: skip
     pyuff.UFF(str(path)).write_sets([inches, one], "overwrite")
-    with pytest.raises(UserError, match="the units IN.*may be in these or in SI"):
+    with pytest.raises(UserError, match=r"the units IN.*may be in these or in SI"):
         read_frequency_response(path)
     pyuff.UFF(str(path)).write_sets(one, "overwrite")
     pyuff.UFF(str(path)).write_sets(one, "add")
