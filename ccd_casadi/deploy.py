@@ -58,6 +58,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
+    from ccd_casadi.deployment.timing_words import shortfall_words
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
@@ -121,31 +122,21 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
-    say(one_line(f"not verified: {_shortfall(found)}"), sys.stderr)
+    say(one_line(f"not verified: {shortfall_words(found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
+    from ccd_casadi.deployment.timing_words import needed_words
     from ccd_casadi.reporting.run_verdict import advice
     from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(
         d=found, status=status_words(run, found), decision=advice(run.result),
-        order=order_words(run, found), figures=figure_rows(run, found),
+        needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
     ).rstrip()  # fmt: skip
-
-
-def _shortfall(found: "Deployment") -> str:
-    """What is not kept, and at which rate it would be."""
-    if not found.shortfalls:
-        return f"the run itself is not: {found.unverified}"
-    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
-    words = f"{rate} is not enough: {found.shortfalls[0]}"
-    if found.needed_hz is None:
-        return f"{words}; with this delay no rate is; shorten the delay"
-    return f"{words}; {found.needed_hz:.6g} Hz is needed"
 
 
 if __name__ == "__main__":

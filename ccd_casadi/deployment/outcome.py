@@ -15,6 +15,7 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.robust.perturbed import SampledFigures
@@ -58,7 +59,7 @@ class Deployment:
     limits, reduced, reduced_figures : LoopLimits, StateSpace, DesignFigures
         What the reduction keeps, K(s) after it, SI, and its loop.
     needed_hz : float or None
-        The least rate that is enough; None where none is.
+        The least rate that is enough, of those of a design its own; None where none is.
     target : Target
         What the sampled loop keeps.
     rate_hz, delay : float
@@ -77,6 +78,8 @@ class Deployment:
         The largest |GS| in m/N and on which plant, and its bound, where the case has one.
     judge : Judgement or None
         Of the code's coefficients on the plants as their function returned them.
+    designed : Sampling or None
+        How the loop was designed to run; None where K(s) was designed.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -97,6 +100,7 @@ class Deployment:
     compliance: tuple[Perturbation, float] | None = None
     compliance_max: float | None = None
     judge: Judgement | None = None
+    designed: Sampling | None = None
 
     @property
     def order(self) -> int:

@@ -205,6 +205,22 @@ def test_a_rate_that_only_the_nominal_plant_stands_is_not_verified(folder: Path)
     assert "gain +2 %" in found.shortfalls[0]
 
 
+def test_a_delay_beyond_that_of_the_design_is_the_cause_and_no_rate_is_the_remedy(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The rate that the loop has already does not make up for more delay; the own delay does."""
+    run, own = folder / "run", read_run(folder / "run").problem.sampling
+    assert own is not None
+    late = ["--delay-samples", str(6.0 * own.delay * own.rate_hz), "--out", str(tmp_path / "late")]
+    assert deploy_main([str(run), *late, *COMMON]) == 4
+    words = capsys.readouterr().err
+    assert f"the delay exceeds the {own.delay_us:g} us of the design" in words
+    assert f"{own.rate_hz:g} Hz is needed" not in words
+    assert json.loads((tmp_path / "late" / "deploy.json").read_text())["needed_rate_hz"] is None
+    kept = ["--delay", str(own.delay), "--out", str(tmp_path / "kept")]
+    assert deploy_main([str(run), *kept, *COMMON]) == 0
+
+
 def test_a_run_that_is_not_verified_deploys_as_such(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
