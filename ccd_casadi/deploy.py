@@ -75,6 +75,11 @@ def main(options: argparse.Namespace) -> ExitCode:
         words = "would overwrite the run's own controller and report"
         raise UserError(f"--out {folder}: {words}; choose another folder")
     timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
+    electronics = Electronics(options.sensor_step, options.force_step, options.jitter, options.seed)
+    designed = finished.problem.sampling
+    rate_hz = options.rate_hz or (designed.rate_hz if designed else None)
+    if rate_hz is not None:  # else the rate is chosen first
+        electronics.require_in_order(1.0 / rate_hz)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     reduced = 0 if kind_of(finished.problem).as_designed else channels
     moved, steps = None, reduced + 2 + (options.saturation is not None)
@@ -87,9 +92,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             moved = on_hardware(
                 finished.plant.plant_si(), found.realisation, found.delay,
                 finished.figures.bandwidth, limits=move_limits(options), window=options.window,
-                hardware=Electronics(
-                    options.sensor_step, options.force_step, options.jitter, options.seed
-                ),
+                hardware=electronics,
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
@@ -106,7 +109,9 @@ def main(options: argparse.Namespace) -> ExitCode:
         (folder / source_code.ST_FILE).write_text(code, "utf-8")
         if options.fmu and not source_code.write_fmu(folder / source_code.FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
+    finished = with_verdict_line(
+        finished, folder, "deployable", deployed_line(finished, found, moved)
+    )
     inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words

@@ -14,6 +14,7 @@ from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictRow
 from ccd_casadi.drawing.paint import block_html, page_html, write_page
+from ccd_casadi.reporting.decision import limited_move, limited_move_remedy, resonance_condition
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped
@@ -188,9 +189,12 @@ def advice(result: Mapping[str, Any]) -> str:
         after = "more lines there, or more averages" if lines else "a smaller S_max"
         after = NEXT["current"] if looked_at == current_concern(result) else after
         return f"{words} Next: {after}." if looked_at else ""
+    stuck = limited_move(result)
+    also = f" Besides, {stuck}." if stuck else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
-        return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
+        step = _next_of_failed(failed[0], result) if failed else "see why"
+        return f"Do not build this: {why}.{also} Next: {step}."
     own = result["verdict"].get("survives", {}).get("set")
     unclosed = states.get("survives") == State.WARNED and own == OwnSet.UNPROVEN
     doubts = _doubts_of_kept_set(result) if own == OwnSet.KEPT else []
@@ -198,7 +202,7 @@ def advice(result: Mapping[str, Any]) -> str:
         words = "Do not build this: it does not survive small errors of its model."
         if own == OwnSet.NONE:
             words = "Do not build this yet: it was judged on the model alone."
-        return f"{words} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
+        return f"{words}{also} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
     warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else doubts
     warned += [
         f"{name} warned"
@@ -208,8 +212,12 @@ def advice(result: Mapping[str, Any]) -> str:
     if states.get("survives") == State.UNKNOWN:
         if unproven(result) == "not known":
             words = "Do not build this yet: what it survives is not known."
-            return f"{words} Next: {NEXT['survives']}."
+            return f"{words}{also} Next: {NEXT['survives']}."
         warned.append(f"the [robust] set is {unproven(result)}")
+    if stuck:
+        return f"Do not build this yet: {stuck}. Next: {limited_move_remedy(result)}."
+    condition = resonance_condition(result)
+    condition = condition and f" {condition}"
     budget = result.get("time_budget", {})
     if ended := bool(budget.get("ended")):
         warned.append(f"the search was ended by its budget of {budget['minutes']:g} min")
@@ -221,10 +229,16 @@ def advice(result: Mapping[str, Any]) -> str:
         steps += [NEXT["loop"]] * (len(looked_at) > len(of_motor))
         steps += [NEXT["budget"]] * ended
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
-        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after
-    return (
-        "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
-    )
+        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after + condition
+    later = " after deploy: hold and delay are not judged yet" if unjudged else ""
+    return f"Build this{later}.{condition}"
+
+
+def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
+    """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
+    line = result["verdict"][name]
+    rate_helps = line.get("needed_hz", 0.0) is not None
+    return NEXT[name] if name != "deployable" or rate_helps else "less delay"
 
 
 def _doubts_of_kept_set(result: Mapping[str, Any]) -> list[str]:
