@@ -1,11 +1,38 @@
-"""What a decision adds to the five lines: the move at its force limit, and what must be known."""
+"""What a decision adds to the five lines: usual limits, the move at its force limit, what must be
+known."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.support.text import inwards, spoken, with_unit
+
+USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
+    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
+    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
+    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
+)
+
+
+@dataclass(frozen=True)
+class ConcernOptions:
+    """Usual limits of a loop beside those of `USUAL`.
+
+    Attributes
+    ----------
+    slack : float
+        Relative: a design lies on its bounds, and 2 is the usual S_max.
+    overshoot : float
+        Of a step without feedforward.
+    between_lines : float
+        What |S| may reach between the lines of a response, over the largest on them.
+    """
+
+    slack: float = 0.01
+    overshoot: float = 0.5
+    between_lines: float = 1.1
 
 
 @dataclass(frozen=True)
@@ -100,3 +127,59 @@ def resonance_condition(
     else:
         return ""
     return f"Condition: {where}; else |S| exceeds S_max."
+
+
+def loop_concerns(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
+    and what is narrow or rings near the bandwidth, against the usual limits of the field.
+
+    The step does not count where the case names the move that the stage makes.
+    """
+    found = [
+        words.format(result[key])
+        for key, least, words in USUAL
+        if result.get(key) is not None and result[key] < (1.0 - options.slack) * least
+    ]
+    if "step_overshoot" in result and "move" not in result:
+        overshoot = result["step_overshoot"]
+        if overshoot > options.overshoot:
+            usual = f"usual: at most {100.0 * options.overshoot:g}"
+            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
+        settled, followed = result["settling_ms"], LoopFigureOptions().periods
+        if settled is None:
+            found.append("a step does not settle within 2 %")
+        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
+            late = f"only after {with_unit(1e-3 * settled, 's')}"
+            found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
+    reach = result.get("sensitivity_peak_between_lines")  # of a measured response
+    if reach is not None and reach > max(1.0, options.between_lines * result["sensitivity_peak"]):
+        where = result.get("sensitivity_peak_between_lines_hz")
+        at = "" if where is None else f" about {where:.4g} Hz"
+        found.append(f"|S| may reach {reach:.3g} between two lines{at}")
+    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
+
+
+def current_concern(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What a move needs beyond the peak current of its motor; empty where it is enough.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConcernOptions
+
+    Returns
+    -------
+    list of str
+    """
+    move = result.get("move") or {}
+    share = move.get("needed_share")
+    if share is None or not share > 1.0 + options.slack:
+        return []
+    most = move["needed_current"] / share
+    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
+    return [f"{words}, and peak_current is {most:.4g} A"]
