@@ -17,7 +17,7 @@ from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
 from ccd_casadi.synthesis.matlab_systems import bare
-from ccd_casadi.synthesis.time_base import HINT, looks_discrete
+from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 Plant = MeasuredResponse | StateSpace
 
@@ -69,7 +69,7 @@ def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
     if isinstance(item, interchange.NamedSystem):
         return item.system, delay + item.delay
     found = interchange.from_control(item)
-    if not found.period and looks_discrete(found.A):  # dt is 0 where nobody gave it
+    if not found.period and appears_discrete(found.A):  # 0 is the default of dt
         tell(f"warning: {HINT}; give dt in s, or convert with d2c")
     return found, delay
 

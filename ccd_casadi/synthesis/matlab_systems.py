@@ -21,7 +21,7 @@ from ccd_casadi.plants.table_columns import (
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.synthesis.time_base import HINT, looks_discrete
+from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 if TYPE_CHECKING:
     import control
@@ -302,7 +302,7 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     if Ts < 0.0:
         raise reader.fail("Ts", "is not a sampling period in s, or 0")
     many.append(f"sampled at {1.0 / Ts:.6g} Hz" if Ts else "continuous")
-    if not Ts and looks_discrete(A):
+    if not Ts and appears_discrete(A):
         if fields.get("ts") is None:
             raise reader.fail("Ts", f"is missing, and {HINT}; give Ts in s, or convert with d2c")
         many.append(f"but {HINT}")

@@ -29,10 +29,10 @@ class TimeBaseOptions:
     least: int = 2
 
 
-HINT = "the matrices look discrete: all eigenvalues within the unit circle, most of them near 1"
+HINT = "the matrices appear discrete: all eigenvalues within the unit circle, most of them near 1"
 
 
-def looks_discrete(A: Array, options: TimeBaseOptions = TimeBaseOptions()) -> bool:
+def appears_discrete(A: Array, options: TimeBaseOptions = TimeBaseOptions()) -> bool:
     """Report whether A is likely one of discrete time.
 
     e^(pT) of a plant that is sampled fast enough lies near 1. The same numbers as poles in 1/s
@@ -49,9 +49,9 @@ def looks_discrete(A: Array, options: TimeBaseOptions = TimeBaseOptions()) -> bo
 
     Examples
     --------
-    >>> looks_discrete(np.array([[1.0, 0.001], [0.0, 0.99]]))
+    >>> appears_discrete(np.array([[1.0, 0.001], [0.0, 0.99]]))
     True
-    >>> looks_discrete(np.array([[0.0, 1.0], [-1.0, -0.1]]))
+    >>> appears_discrete(np.array([[0.0, 1.0], [-1.0, -0.1]]))
     False
     """
     if len(A) < options.least:

@@ -34,7 +34,7 @@ def axis(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
-def asked(path: Path) -> list[str]:
+def questions(path: Path) -> list[str]:
     """The questions about units."""
     found = diagnose(problem_of(load_case(path)))[1]
     assert not [item for item in found if item.severity is Severity.ERROR]
@@ -64,7 +64,7 @@ def test_a_motor_or_a_move_of_no_machine_is_a_question_by_its_key(
     tmp_path: Path, change: list[tuple[str, str]], key: str
 ) -> None:
     path = axis(tmp_path, *change)
-    words = [item for item in asked(path) if "M_K" not in item]
+    words = [item for item in questions(path) if "M_K" not in item]
     assert bool(words) == bool(key)
     assert not key or any(item.startswith(key) for item in words)
     assert all("?" in item for item in words)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from ccd_casadi.studies.tuned_plants import read_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control, read_mat
-from ccd_casadi.synthesis.time_base import looks_discrete
+from ccd_casadi.synthesis.time_base import appears_discrete
 
 MODES = st.lists(st.floats(1.0, 1e4), min_size=0, max_size=4, unique=True)  # rad/s
 
@@ -33,11 +33,11 @@ def plant(modes: list[float], damping: float) -> np.ndarray:
 def test_a_plant_is_seen_in_its_own_time(
     modes: list[float], damping: float, times: float
 ) -> None:
-    """Sampled fast enough for its modes it looks discrete, and continuous it does not."""
+    """Sampled fast enough for its modes it appears discrete, and continuous it does not."""
     A = plant(modes, damping)
     period = 2.0 * np.pi / (times * max([*modes, 1.0]))
-    assert looks_discrete(expm(A * period))
-    assert not looks_discrete(A)
+    assert appears_discrete(expm(A * period))
+    assert not appears_discrete(A)
 
 
 @few(max_examples=60)
@@ -54,7 +54,7 @@ def test_an_unstable_plant_in_odd_units_is_not_taken_for_discrete(
     A = np.zeros((2 * len(blocks), 2 * len(blocks)))
     for i, block in enumerate(blocks):
         A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
-    assert not looks_discrete(A)
+    assert not appears_discrete(A)
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_file_without_a_period_is_refused_with_the_remedy(
 ) -> None:
     path = tmp_path / "plant.mat"
     savemat(path, discrete)
-    with pytest.raises(UserError, match=r"Ts: is missing.* look discrete.*give Ts.*d2c"):
+    with pytest.raises(UserError, match=r"Ts: is missing.* appear discrete.*give Ts.*d2c"):
         read_mat(path)
     savemat(path, {"G": discrete})
     with pytest.raises(UserError, match=r"G\.Ts: is missing"):
@@ -77,19 +77,19 @@ def test_a_file_without_a_period_is_refused_with_the_remedy(
     savemat(path, {**discrete, "Ts": 1e-3})
     assert next(iter(read_mat(path).systems.values())).system.period == 1e-3
     savemat(path, {**discrete, "Ts": 0.0})  # stated: believed, and named
-    assert "look discrete" in next(iter(read_mat(path).systems.values())).words
+    assert "appear discrete" in next(iter(read_mat(path).systems.values())).words
     savemat(path, {**discrete, "A": plant([300.0], 0.02)})
     assert "discrete" not in next(iter(read_mat(path).systems.values())).words
 
 
 def test_a_system_of_python_control_is_named_too(discrete: dict[str, np.ndarray]) -> None:
     parts = [discrete[name] for name in "ABCD"]
-    with pytest.raises(UserError, match=r"dt is None.* look discrete.*give dt"):
+    with pytest.raises(UserError, match=r"dt is None.* appear discrete.*give dt"):
         from_control(control.ss(*parts, None))
     told: list[str] = []
     read_plant(control.ss(*parts), 0.0, told.append)
     assert len(told) == 1
-    assert "look discrete" in told[0]
+    assert "appear discrete" in told[0]
     read_plant(control.ss(*parts, 1e-3), 0.0, told.append)
     read_plant(control.ss(plant([300.0], 0.02), *parts[1:]), 0.0, told.append)
     assert len(told) == 1
