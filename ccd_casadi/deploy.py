@@ -58,6 +58,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
+    from ccd_casadi.deployment.timing_words import shortfall_words
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
@@ -78,6 +79,11 @@ def main(options: argparse.Namespace) -> ExitCode:
         words = "would overwrite the run's own controller and report"
         raise UserError(f"--out {folder}: {words}; choose another folder")
     timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
+    electronics = Electronics(options.sensor_step, options.force_step, options.jitter, options.seed)
+    designed = finished.problem.sampling
+    rate_hz = options.rate_hz or (designed.rate_hz if designed else None)
+    if rate_hz is not None:  # else the rate is chosen first
+        electronics.require_in_order(1.0 / rate_hz)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     reduced = 0 if kind_of(finished.problem).as_designed else channels
     moved, steps = None, reduced + 2 + (options.saturation is not None)
@@ -90,9 +96,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             moved = on_hardware(
                 finished.plant.plant_si(), found.realisation, found.delay,
                 finished.figures.bandwidth, limits=move_limits(options), window=options.window,
-                hardware=Electronics(
-                    options.sensor_step, options.force_step, options.jitter, options.seed
-                ),
+                hardware=electronics,
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
@@ -109,7 +113,9 @@ def main(options: argparse.Namespace) -> ExitCode:
         (folder / source_code.ST_FILE).write_text(code, "utf-8")
         if options.fmu and not source_code.write_fmu(folder / source_code.FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
+    finished = with_verdict_line(
+        finished, folder, "deployable", deployed_line(finished, found, moved)
+    )
     inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words
@@ -125,31 +131,21 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
-    say(one_line(f"not verified: {_shortfall(found)}"), sys.stderr)
+    say(one_line(f"not verified: {shortfall_words(found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
+    from ccd_casadi.deployment.timing_words import needed_words
     from ccd_casadi.reporting.run_verdict import advice
     from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(
         d=found, status=status_words(run, found), decision=advice(run.result),
-        order=order_words(run, found), figures=figure_rows(run, found),
+        needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
     ).rstrip()  # fmt: skip
-
-
-def _shortfall(found: "Deployment") -> str:
-    """What is not kept, and at which rate it would be."""
-    if not found.shortfalls:
-        return f"the run itself is not: {found.unverified}"
-    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
-    words = f"{rate} is not enough: {found.shortfalls[0]}"
-    if found.needed_hz is None:
-        return f"{words}; with this delay no rate is; shorten the delay"
-    return f"{words}; {found.needed_hz:.6g} Hz is needed"
 
 
 if __name__ == "__main__":

@@ -72,11 +72,19 @@ class Move:
 
     @property
     def settled(self) -> float:
-        """Time in s from which the error stays within `window`; inf where the last one is not."""
-        outside = np.flatnonzero(self._size > self.window)
+        """Time in s from which the error stays within `window`; inf where the last one is not, and
+        where one is not finite: a simulation that was lost settles nowhere."""
+        outside = np.flatnonzero(~(self._size <= self.window))
+        if not self.finite:
+            return np.inf
         if not outside.size:
             return 0.0
         return float(self.time[outside[-1] + 1]) if outside[-1] + 1 < len(self.time) else np.inf
+
+    @property
+    def finite(self) -> bool:
+        """Whether the simulation ran to its end: one that diverges leaves double precision."""
+        return bool(np.isfinite(self._size).all())
 
     @property
     def settling(self) -> float:

@@ -21,6 +21,7 @@ from ccd_casadi.cases.findings import (
     unit_findings,
     zero_findings,
 )
+from ccd_casadi.cases.plausibility import plausibility_findings
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import with_ranges
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
@@ -153,6 +154,7 @@ def diagnose(
             ]
             if index == 0:
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
+                here += plausibility_findings(problem, found)
                 here += loop_findings(problem, found, modal) + _unused(problem, plant, system)
             findings += [replace(item, index=index) for item in here]
             facts.append(found)

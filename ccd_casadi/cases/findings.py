@@ -20,7 +20,7 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.text import HZ, spoken
+from ccd_casadi.support.text import HZ, is_force, spoken
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def unit_findings(
     """Warnings about M_K, the resonances and S_max, from the plant at the start."""
     words = [
         *_effort(problem, facts, plant, options),
-        *(_resonances(problem, facts, options) if _states_effort(problem) else []),
+        *(_resonances(problem, facts, options) if states_effort(problem) else []),
         *peak_words(problem.inner.S_max, options=options),
     ]
     return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
@@ -180,14 +180,23 @@ def loop_findings(
             )
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if (run := problem.sampling) is not None:
-        meant = facts.effort_hz if _states_effort(problem) else np.nan
+        meant = facts.effort_hz if states_effort(problem) else np.nan
         words += _lag_words(run, meant, options)
         words += _unstable_words(run, growth, problem.inner.S_max)
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
 
 
-def _states_effort(problem: CoDesignProblem) -> bool:
-    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours."""
+def states_effort(problem: CoDesignProblem) -> bool:
+    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    bool
+    """
     kind = kind_of(problem)
     return not kind.as_designed or kind.bounds().weighted_level is not None
 
@@ -300,11 +309,13 @@ def _effort(
         else "the plant's gain falls through 1/M_K nowhere"
     )
     side = "small" if gain < 1.0 else "large"
+    units = f"M_K (force over displacement) and of mass and stiffness: {SI}"
+    if not is_force(problem.spoken[1]):
+        units = spoken("M_K, which is in N/m, and of the plant's input and output")
     return [
         f"weights.M_K = {M_K:.3g} looks {max(gain, 1.0 / gain):.1g} times too {side}: {where}, "
         f"and [inner] searches {low:.3g} to {high:.3g} Hz; {M_K / gain:.2g} would suit a bandwidth "
-        f"of {aim:.3g} Hz. Check the units of M_K (force over displacement) and of mass and "
-        f"stiffness: {SI}"
+        f"of {aim:.3g} Hz. Check the units of {units}"
     ]
 
 
@@ -316,13 +327,17 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
     high = _searched(problem)[1]
     if suits > options.mismatch * first:
-        moved = spoken(f"{facts.inertia:.3g} kg")
-        against = f"M_K suits {suits:.3g} Hz for the {moved} that an actuator moves"
+        against = f"M_K suits {suits:.3g} Hz"
+        if is_force(problem.spoken[1]):  # of a voltage 1/(b²) is not a mass
+            moved = spoken(f"{facts.inertia:.3g} kg")
+            against += f" for the {moved} that an actuator moves"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:
         return []
     words = f"the first resonance is at {first:.3g} Hz, and {against}"
+    if not is_force(problem.spoken[1]):
+        return [f"{words}: is M_K in another unit?"]
     return [f"{words}: is the stiffness in another unit? {SI}"]
 
 

@@ -13,7 +13,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.plants.plant_facts import PlantFacts
-from ccd_casadi.support.text import number, spoken
+from ccd_casadi.support.text import is_force, number, spoken
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def size_words(
     str
     """
     parts = []
-    if math.isfinite(facts.inertia):
+    if math.isfinite(facts.inertia) and is_force(case.units.input):
         parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
     flexible = [mode.frequency_hz for mode in facts.modes if mode.resonant]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []

@@ -321,7 +321,7 @@ class UnitsTable:
     """[units]: what the plant's outputs and inputs are, in words; numbers are in SI either way."""
 
     output: str = key("of every output", "m", check=checks.choice("m", "rad"))
-    input: str = key("of every input", "N", check=checks.choice("N", "N m"))
+    input: str = key("of every input", "N", check=checks.choice("N", "N m", "V", "A"))
 
 
 @dataclass(frozen=True)

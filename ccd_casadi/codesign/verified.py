@@ -7,7 +7,7 @@ what the outer problem is judged by is here, and results, verdicts and pages use
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -20,6 +20,7 @@ from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import VerdictLine, VerdictOptions, search_evidence, survives
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
@@ -121,9 +122,11 @@ class Verified(ABC):
     def survives_line(self) -> VerdictLine:
         """What the loop survives off its model, and whether the case's own set is kept."""
         damping = "" if self.damping is None else self.damping.words
-        return survives(
+        line = survives(
             self.survival, S_max=self.problem.inner.S_max, other_damping=damping, **self.own_set()
         )
+        held = kind_of(self.problem).common_shifts()
+        return replace(line, figures={**line.figures, "set_shift": list(held)})
 
     def own_set(self) -> dict[str, Any]:
         """What `survives` takes of the case's own set of plants, and of closer models."""

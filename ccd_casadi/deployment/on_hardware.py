@@ -11,11 +11,13 @@ from scipy.linalg import expm
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
 from ccd_casadi.lti.loop import DelayOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.text import inwards
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,28 @@ class Electronics:
         """Whether all of them are zero."""
         return not (self.sensor_step or self.force_step or self.jitter)
 
+    def require_in_order(self, period: float) -> None:
+        """Refuse a jitter of more than a period, with which forces would arrive out of order.
 
+        Parameters
+        ----------
+        period : float
+            Of the loop, s.
+
+        Raises
+        ------
+        UserError
+            Of the option, with the largest value that it may have.
+        """
+        if self.jitter > period:
+            words = f"--jitter {self.jitter:g}: is more than a period of the loop"
+            most = f"{inwards(period, 4, 15):g} s ({1.0 / period:.6g} Hz)"
+            raise UserError(
+                f"{words}, so that forces would arrive out of order; give at most {most}"
+            )
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
 def move(
     plant: StateSpace,
     realisation: Realisation,
@@ -132,6 +155,10 @@ def _stepped(value: Array, step: float) -> Array:
     return np.asarray(step * np.round(value / step)) if step else value
 
 
+UNLIMITED = "feedback alone", "with feedforward"
+BACK, MACHINE = "limited, with back-calculation", "with the electronics"  # as it is deployed
+
+
 @dataclass(frozen=True)
 class OnHardware:
     """Moves of the deployed loop.
@@ -147,6 +174,8 @@ class OnHardware:
     least_limit : float
         Share of the unlimited peak force; NaN where the unlimited move itself does not end in its
         window, and where no limit is given.
+    limit : float or None
+        Largest force, N.
     """
 
     profile: Setpoint
@@ -154,6 +183,27 @@ class OnHardware:
     forward: Array | None
     ways: Mapping[str, Move]
     least_limit: float
+    limit: float | None = None
+
+    @property
+    def limited_entry(self) -> dict[str, Any] | None:
+        """Whether the move settles within the force limit, as the loop is deployed: `state` is
+        unknown where the simulation was lost. None without a limit."""
+        if self.limit is None:
+            return None
+        made = [self.ways[name] for name in (BACK, MACHINE) if name in self.ways]
+        free = [self.ways[name] for name in UNLIMITED if name in self.ways][-1]
+        worst = max(made, key=lambda m: (not m.finite, m.settled))
+        state = State.PASSED if np.isfinite(worst.settled) else State.FAILED
+        state = state if worst.finite else State.UNKNOWN
+        return {
+            "state": state.value,
+            "force_limit": self.limit,
+            "settled": worst.settled if state is State.PASSED else None,
+            "time": float(worst.time[-1]),
+            "left": worst.final_error if worst.finite else None,
+            "settles_unlimited": bool(np.isfinite(free.settled)),
+        }
 
 
 def on_hardware(
@@ -193,6 +243,8 @@ def on_hardware(
         The moves.
     """
     profile, K = setpoint(limits), realisation.system
+    if hardware is not None:
+        hardware.require_in_order(K.period)
     free = replace(realisation, saturation=None, back_calculation=None)
     try:
         forward = feedforward(plant, K.period, delay)
@@ -201,16 +253,16 @@ def on_hardware(
     made = partial(move, plant, delay=delay, profile=profile, window=window, options=options)
     progress("a move")
     unlimited = made(free)
-    ways = {"feedback alone": unlimited}
+    ways = {UNLIMITED[0]: unlimited}
     if forward is not None:
-        ways["with feedforward"] = unlimited = made(free, forward=forward)
+        ways[UNLIMITED[1]] = unlimited = made(free, forward=forward)
     if realisation.saturation is not None:
         clipped = replace(realisation, back_calculation=None)
         words = f"limited to {realisation.saturation:.4g} N, only clipped"
         ways[words] = made(clipped, forward=forward)
-        ways["limited, with back-calculation"] = made(realisation, forward=forward)
+        ways[BACK] = made(realisation, forward=forward)
     if hardware is not None and not hardware.ideal:
-        ways["with the electronics"] = made(realisation, forward=forward, hardware=hardware)
+        ways[MACHINE] = made(realisation, forward=forward, hardware=hardware)
     peak, least = float(unlimited.peak_force.max()), np.nan
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
@@ -220,7 +272,7 @@ def on_hardware(
             if not np.isfinite(made(held, forward=forward).settled):
                 break
             least = share
-    return OnHardware(profile, window, forward, ways, least)
+    return OnHardware(profile, window, forward, ways, least, realisation.saturation)
 
 
 def hardware_dict(found: OnHardware) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """A deployment: what was found on the way from a run's controller to code, and its verdict in
 words."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deployment.discretise import Conversion, Target
+from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import LoopChannel, Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
@@ -15,11 +17,12 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, spoken
 from ccd_casadi.synthesis.statics import Statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -58,7 +61,7 @@ class Deployment:
     limits, reduced, reduced_figures : LoopLimits, StateSpace, DesignFigures
         What the reduction keeps, K(s) after it, SI, and its loop.
     needed_hz : float or None
-        The least rate that is enough; None where none is.
+        The least rate that is enough, of those of a design its own; None where none is.
     target : Target
         What the sampled loop keeps.
     rate_hz, delay : float
@@ -77,6 +80,8 @@ class Deployment:
         The largest |GS| in m/N and on which plant, and its bound, where the case has one.
     judge : Judgement or None
         Of the code's coefficients on the plants as their function returned them.
+    designed : Sampling or None
+        How the loop was designed to run; None where K(s) was designed.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -97,6 +102,7 @@ class Deployment:
     compliance: tuple[Perturbation, float] | None = None
     compliance_max: float | None = None
     judge: Judgement | None = None
+    designed: Sampling | None = None
 
     @property
     def order(self) -> int:
@@ -194,22 +200,27 @@ def short_status(run: FinishedRun, found: Deployment) -> str:
     return "verified"
 
 
-def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
+def deployed_line(
+    run: FinishedRun, found: Deployment, moved: OnHardware | None = None
+) -> VerdictLine:
     """The line `deployable` of the run's verdict.
 
     Parameters
     ----------
     run, found : FinishedRun, Deployment
         The run and what was deployed of it.
+    moved : OnHardware or None
+        Its simulated move.
 
     Returns
     -------
     VerdictLine
-        Failed where the sampled loop does not keep its target on a plant.
+        Failed where the sampled loop does not keep its target on a plant; warned where its move
+        does not settle within a force limit.
     """
     K = found.sampled
     at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
-    figures = {
+    figures: dict[str, Any] = {
         "rate_hz": found.rate_hz,
         "delay": found.delay,
         "needed_hz": found.needed_hz,
@@ -220,6 +231,7 @@ def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
         "worst_bandwidth_hz": found.worst.figures.bandwidth / HZ,
         "plants": 1 + len(found.members),
         "judge": None if found.judge is None else found.judge.entry,
+        "move": None if moved is None else moved.limited_entry,
     }
     if found.shortfalls:
         return VerdictLine(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
@@ -230,10 +242,31 @@ def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
         if worst.figures is not K:
             where = place_words(worst.at)
             kept += f"; on the plant with the largest peak ({where}) {_loop_words(worst.figures)}"
-    reason = "; ".join(filter(None, (reason_words(run, found), *found.levels)))
+    ends = limit_words(figures["move"] or {})
+    reason = "; ".join(filter(None, (reason_words(run, found), *found.levels, ends)))
     if reason:
         return VerdictLine(State.WARNED, f"{kept}; {reason}", figures)
     return VerdictLine(State.PASSED, kept, figures)
+
+
+def limit_words(move: Mapping[str, Any]) -> str:
+    """Write that a move within a force limit does not settle, or that this is not known.
+
+    Parameters
+    ----------
+    move : mapping
+        As `limited_entry` of `OnHardware` gives it.
+
+    Returns
+    -------
+    str
+        Empty where it settles.
+    """
+    ends = {State.FAILED.value: "does not settle", State.UNKNOWN.value: "could not be simulated"}
+    state = move.get("state", "")
+    return (
+        spoken(f"a move within {move['force_limit']:.4g} N {ends[state]}") if state in ends else ""
+    )
 
 
 def _loop_words(found: SampledFigures) -> str:

@@ -91,10 +91,11 @@ class DeploymentOptions:
 def at_its_rate(
     run: FinishedRun, channels: tuple[LoopChannel, ...], family: tuple[Member, ...],
     designed: Sampling, timing: Timing, options: DeploymentOptions = DeploymentOptions(),
-) -> tuple[Target, float, float, float]:  # fmt: skip
-    """Target, the rate that is needed by Tustin's rule, and the rate and delay to run at.
+) -> tuple[Target, float | None, float, float]:  # fmt: skip
+    """Target, the rate that is enough by Tustin's rule, and the rate and delay to run at.
 
-    What was designed is the sampled loop: a given rate or delay is compared with that.
+    What was designed is the sampled loop: a given rate or delay is compared with that. Enough is
+    the rate at which it runs or that of the design, with this delay; else None.
     """
     tustin, rate = Conversion.TUSTIN, timing.rate_hz or designed.rate_hz
     plant = run.plant.plant_si()
@@ -104,8 +105,10 @@ def at_its_rate(
     if timing.delay is None and timing.delay_samples == Timing.delay_samples:
         timing = replace(timing, delay=designed.delay)
     loops = [(channel, run.controller) for channel in channels]
-    met = loops_meet(loops, target, tustin, rate, timing, WorstFirst(family))
-    needed = rate if met else designed.rate_hz
+    order = WorstFirst(family)
+    tried = dict.fromkeys((rate, designed.rate_hz))
+    enough = (hz for hz in tried if loops_meet(loops, target, tustin, hz, timing, order))
+    needed = next(enough, None)
     return target, needed, rate, timing.delay_at(rate)
 
 
@@ -222,7 +225,7 @@ def deploy(
     if designed is not None:
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
-        way |= {"needed_hz": own_hz, "target": target}
+        way |= {"needed_hz": own_hz, "target": target, "designed": designed}
         found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
         return replace(found, judge=attempted(_judged, run, found))
     loops = list(zip(channels, small, strict=True))

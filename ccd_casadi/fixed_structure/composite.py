@@ -122,7 +122,7 @@ class CompositeProblem(LoopProblem):
             out[which] = part.problem.inverse_square(own, tau + part.lead)
         return out
 
-    def plants_of(self, constraints: Constraints) -> np.ndarray:
+    def plants_of(self, constraints: RowPlaces) -> np.ndarray:
         out = np.zeros(len(constraints.v), int)
         for part, at, own in self.split(constraints):
             out[at] = part.members[part.problem.plants_of(own)]

@@ -3,7 +3,8 @@
 Each line is a plant of its own: one mode whose response at that line is the one that was measured.
 The rows, their slopes and their curvature are so those of every other set (`kernels.loop_rows`), at
 frequencies that do not move. ω_b lies between two lines,
-where ln σ(S) is a straight line over ln v. Stability is the winding of det(I + GK).
+where ln σ(S) is a straight line over ln v. Stability is the winding of det(I + GK). Where a
+response has a spread, S is that of all plants within it (`measured_loop`): ln σ(S) - ln ρ.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,9 +30,23 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_grid import NONE, second
 from ccd_casadi.kernels.loop_point import LoopArrays, levels, rows
+from ccd_casadi.kernels.sections import Limit
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
+
+
+@dataclass(frozen=True)
+class SpreadOptions:
+    """Numbers of the bound on all plants within a spread.
+
+    Attributes
+    ----------
+    least : float
+        ρ below which -ln ρ continues straight: a start may have plants that reach -1.
+    """
+
+    least: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -62,14 +77,58 @@ class LinePlants(PlantSet):
 class LineProblem(LoopProblem):
     """`responses` as they were measured; `starts`: index of the first line of each, and the end.
 
-    `effort` bounds |KS| by that many times 1/|G| about ω_b. The last plants of the set are the
-    responses at ω_low, one each.
+    `effort` bounds |KS| by that many times 1/|G| about ω_b. `unsure` (lines,): ‖Δ‖ of the spread in
+    the unit of G. The last plants of the set are the responses at ω_low, one each.
     """
 
     responses: tuple[MeasuredResponse, ...] = ()
     v: Array = field(default_factory=lambda: np.zeros(0))
     starts: tuple[int, ...] = ()
     effort: float | None = None
+    unsure: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def spreads(self) -> bool:
+        """Whether any line has a spread."""
+        return bool(self.unsure.any())
+
+    def _loop_of_KS(self, kappa: Array, tau: float) -> LoopArrays:
+        """The loop with |KS| held against 1."""
+        loop = super().loop(kappa, tau)
+        loop.limits[[LoopCurve.KS, Limit.KS_ZERO, Limit.KS_POLE]] = 0.0
+        return loop
+
+    def losses(self, kappa: Array, tau: float) -> Array:
+        """-ln ρ of every line."""
+        lines = len(self.unsure)
+        if not self.spreads:
+            return np.zeros(lines)
+        codes = np.full((lines, 1), LoopCurve.KS, np.int64)
+        size = levels(codes, np.arange(lines), self.v[:lines, None],
+                      self._loop_of_KS(kappa, tau), -np.inf, NONE)[:, 0, 0, 0]  # fmt: skip
+        return self._lost(np.exp(size) * self.unsure)[0]
+
+    def losses_at(self, kappa: Array, tau: float, lines: np.ndarray) -> tuple[Array, np.ndarray]:
+        """-ln ρ of some lines (M,), and their derivatives to κ (M, n)."""
+        value = np.zeros(len(lines))
+        to_kappa = np.zeros((len(lines), len(kappa)))
+        unsure = np.append(self.unsure, np.zeros(self.plants.count - len(self.unsure)))[lines]
+        known = unsure > 0.0
+        if known.any():
+            at = lines[known]
+            code = np.full(len(at), LoopCurve.KS)
+            size, _, slopes, *_ = rows(code, np.zeros(len(at), np.int64), at, self.v[at],
+                                       self._loop_of_KS(kappa, tau))  # fmt: skip
+            share = np.exp(size) * unsure[known]
+            value[known], rate = self._lost(share)
+            to_kappa[known] = (rate * share)[:, None] * slopes
+        return value, to_kappa
+
+    def _lost(self, share: Array, options: SpreadOptions = SpreadOptions()) -> tuple[Array, Array]:
+        """-ln ρ with ρ = 1 - share, and its slope to the share."""
+        room = 1.0 - share
+        held = np.maximum(room, options.least)
+        return -np.log(held) + (held - room) / held, 1.0 / held
 
     @cached_property
     def curves(self) -> tuple[LoopCurve, ...]:
@@ -175,8 +234,9 @@ def line_problem(
     box = structure.bounds((slowest, fastest), gains)
     v = plants.variable(omega)
     starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
+    unsure = force * np.concatenate([one.unsure for one in responses])
     return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts,
-                       effort)  # fmt: skip
+                       effort, unsure)  # fmt: skip
 
 
 def _modes(omega: Array, G: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -189,6 +249,22 @@ def _modes(omega: Array, G: np.ndarray, period: float | None) -> tuple[np.ndarra
     basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
     parts = np.linalg.solve(basis, np.stack([G.real, G.imag], axis=1).reshape(count, 2, p * m))
     return pole[:, None], (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
+
+
+WITHOUT_S = (LoopCurve.KS, LoopCurve.T, LoopCurve.GS)
+_of_loops = constraints.dispatch(LoopProblem)
+
+
+@constraints.register
+def _(problem: LineProblem, kappa: Array, tau: float, at: RowPlaces) -> Constraints:
+    """Rows of S with -ln ρ of their lines."""
+    found = _of_loops(problem, kappa, tau, at)
+    if problem.spreads:
+        own = np.flatnonzero(~np.isin(at.curve, WITHOUT_S))
+        lost, slopes = problem.losses_at(kappa, tau, problem.plants_of(at)[own])
+        found.value[own] += lost
+        found.to_kappa[own] += slopes
+    return found
 
 
 @assess.register
@@ -216,6 +292,7 @@ def _(
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, relevant, NONE)[:, 0]
     beyond = v[:lines, None, None] > crossing
     idle = np.where(beyond, problem.short[:, None], problem.late[:, None])
+    value = value + ~np.isin(codes, WITHOUT_S)[:, None] * problem.losses(kappa, tau)[:, None, None]
     value = np.where(idle, -np.inf, value)
     i, c, k = np.nonzero(value > relevant)
     at_low = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.S_LOW]))
@@ -225,11 +302,13 @@ def _(
     found = constraints(problem, kappa, tau, RowPlaces(curve, row, v[row % P]))
     found.to_tau[curve == LoopCurve.KS] = -problem.ceiling(tau)[1]
     none = np.zeros(0, np.int64)
-    peaks = found.and_those(_ends(problem, loop, crossing))
+    peaks = found.and_those(_ends(problem, kappa, tau, loop, crossing))
     return Assessment(True, np.zeros(0), peaks, RowPlaces(none, none, np.zeros(0)))
 
 
-def _ends(problem: LineProblem, loop: object, crossing: Array) -> Constraints:
+def _ends(
+    problem: LineProblem, kappa: Array, tau: float, loop: object, crossing: Array
+) -> Constraints:
     """ln|S(jω_b)| + ½ ln 2 of every response and number."""
     P, v, found = problem.plants.count, problem.v, []
     numbers = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.CROSSING]))
@@ -240,6 +319,9 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> Constraints:
             which, at = np.array([i - 1, i]), v[[i - 1, i]]
             code = np.full(2, LoopCurve.CROSSING)
             value, _, to_kappa, *_ = rows(code, np.full(2, number), which, at, loop)
+            if problem.spreads:
+                lost, slopes = problem.losses_at(kappa, tau, which)
+                value, to_kappa = value + lost, to_kappa + slopes
             width = np.log(at[1] / at[0])
             share = np.log(place / at[0]) / width
             mean = np.array([1.0 - share, share])

@@ -229,7 +229,7 @@ class LoopProblem:
         kinds = {Place.WHOLE: COUNTED_ROW, Place.SENSOR: AT_SENSOR, Place.ACTUATOR: AT_ACTUATOR}
         return np.array([kinds[one.place] for one in self.bounds.channels], np.int64)
 
-    def plants_of(self, constraints: "Constraints") -> np.ndarray:
+    def plants_of(self, constraints: "RowPlaces") -> np.ndarray:
         """The number of the plant that each row is of: several rows of a plant are numbered on."""
         return constraints.plant % self.plants.count
 

@@ -133,6 +133,7 @@ def design_on_data(
                 f"the measured response is {one.derivative}; G is displacement over force"
             )
         one.require_causal()
+        _require_known_gain(one)
     sign = 1.0
     if shapes == {(1, 1)}:
         sign = _sign(responses)
@@ -161,6 +162,22 @@ def design_on_data(
             break
     assert best is not None
     return best if sign > 0.0 else _turned(best)
+
+
+def _require_known_gain(measured: MeasuredResponse) -> None:
+    """Raise UserError where the spread lets G be singular from the first line on: there |L| is
+    large, KS is all but G⁻¹, and no such controller is safe."""
+    least = np.linalg.norm(measured.matrix, -2, axis=(1, 2))
+    known = measured.unsure < least
+    if not known[0]:
+        first = f"{measured.hz[0]:.4g} Hz"
+        next_ = measured.hz[np.argmax(known)] if known.any() else np.inf
+        share = measured.unsure[0] / least[0]
+        raise UserError(
+            f"at the first line, {first}, the spread is {share:.3g} times the least gain, so its "
+            f"sign is not known: measure longer there, drop the lines below {next_:.4g} Hz, or "
+            "state a factor on the spread (--spread, spread)"
+        )
 
 
 def _sign(responses: Sequence[MeasuredResponse]) -> float:

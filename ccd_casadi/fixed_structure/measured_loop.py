@@ -1,6 +1,11 @@
 """A controller judged on the lines of a measured response.
 
-Bounds are held on every line; between two lines see `between_lines`.
+Bounds are held on every line, with a spread Δ for every plant within it: there
+
+    σ_max(S) <= σ_max(S₀)/ρ,   ρ = 1 - σ_max(K S₀) ‖Δ‖,
+
+for (I + (G + E) K)⁻¹ = S₀ (I + E K S₀)⁻¹ and |E| <= Δ entry by entry. While ρ > 0 the winding is
+that of G. Of one channel 1/|S| >= |1 + GK| - |K| Δ. Between two lines see `between_lines`.
 
 Stability is the winding of F = det(I + GK). Over all ω > 0 its angle grows by
 
@@ -117,6 +122,11 @@ def judge(
         return MeasuredFigures(False, sure, Z, words)
     omega, low = HZ * hz, bounds.omega_low / HZ
     size = {name: sigma_max(M) for name, M in responses_of(G, k[first:]).items()}
+    room = 1.0 - size["KS"] * measured.unsure
+    if room.min() < 1.0:
+        words += "; every bound on S is that of all plants within the spread"
+    with np.errstate(divide="ignore"):
+        size["S"] = np.where(room > 0.0, size["S"] / np.maximum(room, 0.0), np.inf)
     most = {name: float(size[name].max()) for name in ("KS", "T", "GS")}
     if bounds.weights is not None:
         W = np.abs(bounds.weights.responses(omega))

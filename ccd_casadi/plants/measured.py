@@ -142,6 +142,14 @@ class MeasuredResponse:
         return np.asarray((self.matrix[0] * 1j**self.slope).real)
 
     @property
+    def unsure(self) -> Array:
+        """‖Δ‖ (k,) of the spread Δ, m/N, the largest singular value: that of every E within it is
+        no larger. 0 without a spread."""
+        if self.spread is None:
+            return np.zeros(len(self.hz))
+        return np.asarray(np.linalg.norm(self.spread.reshape(self.matrix.shape), 2, axis=(1, 2)))
+
+    @property
     def resonances(self) -> np.ndarray:
         """The lines (indices) of the peaks of |G|, the strongest first."""
         return self._extremes(1.0)

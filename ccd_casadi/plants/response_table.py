@@ -14,6 +14,7 @@ import scipy
 
 from ccd_casadi.plants.table_columns import (
     MEGA,
+    RATE_WORDS,
     UNITS,
     WANTED,
     TableColumn,
@@ -22,10 +23,14 @@ from ccd_casadi.plants.table_columns import (
     columns_of_csv,
     meaning_of,
     npz_arrays,
+    rate_order,
 )
+from ccd_casadi.plants.universal_file import SUFFIXES, columns_of_universal
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
+
+BESIDE = ("spread", "coherence", "averages")
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,8 @@ class ReadingOptions:
         Share of the misfit below which another reading is as likely.
     end : float
         Factor of the first and the last line within which the slope beyond them is read.
+    confidence : float
+        Of a spread that coherence and averages give.
     """
 
     few_degrees: float = 30.0
@@ -57,6 +64,7 @@ class ReadingOptions:
     bode_misfit: float = float(np.radians(20.0))
     bode_gain: float = 0.85
     end: float = 1.5
+    confidence: float = 0.95
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ class ResponseTable:
 
 
 def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> ResponseTable:
-    """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
+    """The response in a file of any kind. Raises UserError that names what is not clear."""
     suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
         content = npz_arrays(path)
@@ -81,6 +89,8 @@ def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> Res
     elif suffix == ".mat":
         content = mat_variables(path)
         columns = columns_of_arrays(path, lines_in(content) or content)
+    elif suffix in SUFFIXES:
+        columns, notes = columns_of_universal(path)
     else:
         columns, notes = columns_of_csv(path)
     return _understood(path, columns, notes, options)
@@ -124,17 +134,20 @@ def _understood(
     if "f" not in known:
         raise UserError(f"{path}: has no column f_hz; give the frequencies that name")
     hz, rows = known["f"][0].values.real.astype(float) * known["f"][1], known["f"][0].rows
-    given = known.keys() - {"f", "spread", "coherence"}
+    given = known.keys() - {"f", *BESIDE}
     if given not in ({"re", "im"}, {"size", "angle"}, {"G"}, {"G", "angle"}):
         names = ", ".join(known[key][0].name for key in sorted(given)) or "nothing else"
         raise UserError(f"{path}: needs re and im, or magnitude and phase, or G alone: has {names}")
     parts = {key: np.asarray(column.values) for key, (column, _) in known.items()}
-    for key in parts.keys() - {"f", "coherence"}:
+    for key in parts.keys() - {"f", "coherence", "averages"}:
         if parts[key].ndim == 1 and parts[key].shape != hz.shape:
             words = f"has {len(parts[key])} values and {known['f'][0].name} {len(hz)}"
             raise UserError(f"{path}: {known[key][0].name}: {words}")
         if key != "G" and np.iscomplexobj(parts[key]):
             raise UserError(f"{path}: {known[key][0].name}: is complex; name it G")
+    orders = {rate_order(path, known[key][0].name) for key in given - {"angle"}}
+    if len(orders) > 1:
+        raise UserError(f"{path}: re and im are of different derivatives; give both of one")
     G: np.ndarray
     if given == {"re", "im"}:
         if known["re"][1] != known["im"][1]:
@@ -169,10 +182,32 @@ def _understood(
         word = f"line {rows[i]}" if rows else f"value {i + 1} of f_hz"
         raise UserError(f"{path}: {word} {how} {hz[i]:.6g} Hz; frequencies have to rise")
     hz, G, spread = hz[kept], G[kept], spread if spread is None else spread[kept]
-    left = [known["coherence"][0].name + " is left out"] if "coherence" in known else []
-    names = ", ".join(known[key][0].name for key in known if key != "coherence")
+    order = orders.pop()
+    if order:
+        rate = ((2j * np.pi * hz) ** order).reshape(-1, *[1] * (G.ndim - 1))
+        G, spread = G / rate, spread if spread is None else spread / np.abs(rate)
+        notes = [*notes, RATE_WORDS[order]]
+    left = [f"{known[key][0].name} is left out" for key in BESIDE[1:] if key in known]
+    if spread is None and {"coherence", "averages"} <= known.keys() and G.ndim == 1:
+        spread = _of_coherence(path, G, parts["coherence"][kept], parts["averages"], options)
+        left = [f"spread of {100.0 * options.confidence:g} % by coherence and averages"]
+    names = ", ".join(known[key][0].name for key in known if key not in BESIDE[1:])
     span = f"{len(hz)} lines from {hz[0]:.4g} to {hz[-1]:.4g} Hz" if len(hz) else "no line"
     return ResponseTable(hz, G, spread, "; ".join([f"{span} of {names}", *notes, *left]))
+
+
+def _of_coherence(
+    path: Path, G: np.ndarray, coherence: Array, averages: Array, options: ReadingOptions
+) -> Array:
+    """The spread |G| sqrt(ln(1/(1 - P)) (1 - γ²)/(γ² n)) of coherence γ² and n averages (Bendat and
+    Piersol, Random Data, 4th ed., 2010, section 9.2): Ĝ lies within it with the probability P."""
+    count = float(np.min(averages))
+    inside = (coherence > 0.0) & (coherence <= 1.0)
+    if not (count >= 1.0 and inside.all()):
+        words = "coherence has to be in 0 to 1 and averages 1 or more"
+        raise UserError(f"{path}: {words}; correct them or drop one")
+    wide = np.log(1.0 / (1.0 - options.confidence)) * (1.0 - coherence) / (coherence * count)
+    return np.asarray(np.abs(G) * np.sqrt(wide))
 
 
 def _quantities(
@@ -186,6 +221,8 @@ def _quantities(
             words = "is not understood and may change the plant; drop it, or name"
             raise UserError(f"{path}: {column.name!r}: {words} {WANTED}")
         quantity, unit = found
+        if quantity == "size" and np.iscomplexobj(column.values):
+            quantity = "G"
         if quantity in seen:
             first = seen[quantity]
             words = f"column {first!r} is there twice" if first == column.name else (

@@ -11,27 +11,46 @@ import scipy
 
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text_table import (
+    READ,
+    cells,
+    decimal_comma,
+    is_number,
+    number_in,
+    separator,
+    text_of,
+)
 
 NAMES = {
-    "f": "f", "freq": "f", "frequency": "f",
-    "re": "re", "real": "re", "real part": "re",
-    "im": "im", "imag": "im", "imaginary": "im", "imaginary part": "im",
-    "magnitude": "size", "mag": "size", "amplitude": "size",
+    "f": "f", "freq": "f", "frequency": "f", "frequenz": "f", "omega": "f", "ω": "f", "w": "f",
+    "re": "re", "real": "re", "real part": "re", "realteil": "re",
+    "im": "im", "imag": "im", "imaginary": "im", "imaginary part": "im", "imaginärteil": "im",
+    "magnitude": "size", "mag": "size", "amplitude": "size", "betrag": "size", "gain": "size",
+    "receptance": "size", "mobility": "size", "accelerance": "size", "inertance": "size",
     "phase": "angle", "angle": "angle",
-    "g": "G", "response": "G",
-    "spread": "spread", "coherence": "coherence",
+    "g": "G", "response": "G", "responsedata": "G",  # of MATLAB's frd
+    "spread": "spread", "coherence": "coherence", "kohärenz": "coherence",
+    "averages": "averages", "number of averages": "averages",
 }  # fmt: skip
 COMPLIANCE = {  # by the casefolded unit, in which both signs of micro are one
     "": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "\N{GREEK SMALL LETTER MU}m/n": 1e-6,
     "nm/n": 1e-9, "rad/(n m)": 1.0, "rad/n m": 1.0, "rad/nm": 1.0,
 }  # fmt: skip
+RATES = {  # units of a velocity or an acceleration over a force: the order of the derivative
+    "m/s/n": 1, "(m/s)/n": 1, "m/(n s)": 1, "m/(s n)": 1,
+    "m/s^2/n": 2, "(m/s^2)/n": 2, "m/s²/n": 2, "(m/s²)/n": 2, "m/s2/n": 2, "1/kg": 2,
+}  # fmt: skip
+RATE_NAMES = {"mobility": 1, "accelerance": 2, "inertance": 2}
+RATE_WORDS = {1: "a mobility, divided by j 2π f", 2: "an accelerance, divided by -(2π f)²"}
+ANGULAR = ("omega", "ω", "w")  # in rad/s where no unit is named
+OF_RESPONSE = COMPLIANCE | dict.fromkeys(RATES, 1.0)
 UNITS = {
-    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
-    "size": COMPLIANCE | {"db": -1.0},  # a size in decibels
+    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ, "rad/timeunit": 1.0 / HZ},
+    "size": OF_RESPONSE | {"db": -1.0},  # a size in decibels
     "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
     | dict.fromkeys(("rad", "radian", "radians"), 1.0),
-    "re": COMPLIANCE, "im": COMPLIANCE, "G": COMPLIANCE, "spread": COMPLIANCE,
-    "coherence": {"": 1.0},
+    "re": OF_RESPONSE, "im": OF_RESPONSE, "G": OF_RESPONSE, "spread": COMPLIANCE,
+    "coherence": {"": 1.0}, "averages": {"": 1.0},
 }  # fmt: skip
 AS_WRITTEN = {"f": "Hz or rad/s", "angle": "deg or rad", "size": "m/N, mm/N, µm/N, nm/N or dB"}
 MEGA = re.compile(r"(?<![A-Za-z])M[mM]\s*/")  # as a prefix M is mega, never milli
@@ -39,12 +58,10 @@ COMMENT = re.compile(r"\s*[#%]+\s*(\w[\w ]*?)\s*[:=]\s*(.*\S)")  # a name and it
 CHANGES = frozenset({"gain", "gains", "scale", "scaling", "factor", "delay", "delays", "lag",
                      "latency", "deadtime", "rate", "period", "dt", "fs", "ts"})  # fmt: skip
 UNIT_NAME = re.compile(r"(?:(.*?)[ _]*units?|units?[ _]+(?:of[ _]+)?(.*))", re.IGNORECASE)
-SI = ("", "m", "n", "m/n", "rad", "n m")  # a unit beside the columns that changes none of them
+SI = ("", "m", "n", "m/n", "rad", "n m", "seconds")  # units that change no column
 WANTED = (
     "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 )
-READ = "CSV, .npz and .mat are read"
-DIGITS = "0123456789+-."
 _PLAIN = ("-", "1", "abs", "linear")  # units of a ratio
 
 
@@ -54,7 +71,7 @@ def npz_arrays(path: Path) -> dict[str, np.ndarray]:
             return dict(file)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or described(error)
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
+        raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
 @dataclass(frozen=True)
@@ -203,7 +220,7 @@ def _with_stated_unit(
 
 def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     """The columns of a text table, and what of its form is to be reported."""
-    text, notes = _text(path)
+    text, notes = text_of(path)
     lines, comments = list[tuple[int, str]](), list[tuple[int, str]]()
     for i, line in enumerate(text.splitlines(), 1):
         if line.lstrip().startswith(("#", "%")):
@@ -212,19 +229,24 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
             lines.append((i, line))
     if not lines:
         raise UserError(f"{path}: is empty; it needs a header and lines of numbers")
-    if lines[0][1].strip() == "-1" or path.suffix.lower() in (".uff", ".unv"):
-        raise UserError(f"{path}: is a universal file; {READ}: write it as one of them")
+    if lines[0][1].strip() == "-1":
+        raise UserError(f"{path}: is a universal file; name it {path.stem}.uff")
     last = lines[-1][1]
-    mark = next((mark for mark in "\t;," if mark in last), None)
-    rows = [(i, _cells(line, mark)) for i, line in lines]
-    comma, note = _decimal_comma(path, rows, mark)
+    mark = separator(last)
+    rows = [(i, cells(line, mark)) for i, line in lines]
+    comma, note = decimal_comma(path, rows, mark)
     notes += note
-    numeric = (len(row) > 1 and all(_is_number(cell, comma) for cell in row) for _, row in rows)
+    numeric = (len(row) > 1 and all(is_number(cell, comma) for cell in row) for _, row in rows)
     first = next((k for k, found in enumerate(numeric) if found), None)
     if first is None:
-        bad = next((cell for cell in rows[-1][1] if not _is_number(cell, comma)), last.strip())
+        bad = next((cell for cell in rows[-1][1] if not is_number(cell, comma)), last.strip())
         words = f"is not a table of numbers with a header: {bad!r} in line {rows[-1][0]}"
         raise UserError(f"{path}: {words} is no number; {READ}")
+    above = [(i, line.lstrip(" #%")) for i, line in comments if i < rows[0][0]]
+    if first == 0 and above and len(cells(above[-1][1], mark)) == len(rows[0][1]):
+        rows, first = [(above[-1][0], cells(above[-1][1], mark)), *rows], 1
+        comments = [item for item in comments if item[0] != above[-1][0]]
+        notes.append(f"line {above[-1][0]} is the header")
     if first == 0:
         raise UserError(f"{path}: line {rows[0][0]}: has no header above it; name {WANTED}")
     at = first - 1
@@ -245,10 +267,10 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     for i, row in rows[first:]:
         if len(row) != len(names):
             words = f"has {len(row)} cells and the header {len(names)}"
-            if mark == "," and len(row) == 2 * len(names):
+            if mark == "," and len(row) > len(names):
                 words += ": are its decimals commas too? separate the columns by semicolons"
             raise UserError(f"{path}: line {i}: {words}")
-        table.append([_number(path, i, cell, comma) for cell in row])
+        table.append([number_in(path, i, cell, comma) for cell in row])
     numbers = tuple(i for i, _ in rows[first:])
     values = np.array(table)
     parts = [values[:, j] if values[:, j].imag.any() else values[:, j].real
@@ -266,92 +288,49 @@ def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     return columns, notes
 
 
-def _text(path: Path) -> tuple[str, list[str]]:
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        try:
-            return raw.decode("utf-16"), ["encoded as UTF-16"]
-        except UnicodeDecodeError:
-            raise UserError(f"{path}: is not a table of numbers; {READ}") from None
-    if b"\0" in raw:
-        raise UserError(f"{path}: is not a table of numbers but a binary file; {READ}")
-    try:
-        return raw.decode("utf-8-sig"), []
-    except UnicodeDecodeError:
-        return raw.decode("latin-1"), ["encoded as Latin-1"]
-
-
-def _cells(line: str, mark: str | None) -> list[str]:
-    parts = [part.strip().strip('"').strip() for part in line.split(mark)]
-    while len(parts) > 1 and not parts[-1]:
-        parts.pop()
-    return parts
-
-
-def _decimal_comma(
-    path: Path, rows: Sequence[tuple[int, list[str]]], mark: str | None
-) -> tuple[bool, list[str]]:
-    """Whether its decimals are commas, and what is to be reported of its form."""
-    word = {"\t": "tabs", ";": "semicolons", None: "spaces"}.get(mark, "")
-    notes = [f"separated by {word}"] if word else []
-    if mark == ",":
-        return False, notes
-    cells = [
-        (i, c) for i, row in rows for c in row if c and set(c.casefold()) <= set(DIGITS + ",e")
-    ]
-    with_comma = [(i, c) for i, c in cells if "," in c]
-    if not with_comma:
-        return False, notes
-    both = next((i for i, c in with_comma if "." in c or c.count(",") > 1), None)
-    if both is None and any("." in c for _, c in cells):
-        both = with_comma[0][0]
-    thousands = all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", c) for _, c in with_comma)
-    if both is not None or thousands:
-        words = "a comma may be a decimal or part thousands; write decimals with a point"
-        raise UserError(f"{path}: line {both or with_comma[0][0]}: {words}")
-    return True, [*notes, "decimals by commas"]
-
-
-def _is_number(cell: str, comma: bool) -> bool:
-    try:
-        _parsed(cell, comma)
-    except ValueError:
-        return False
-    return True
-
-
-def _parsed(cell: str, comma: bool) -> complex:
-    cell = cell.replace(",", ".") if comma else cell
-    return complex(re.sub(r"(?<=[\d.])[iI]$", "j", cell.replace(" ", "")))
-
-
-def _number(path: Path, line: int, cell: str, comma: bool) -> complex:
-    try:
-        found = _parsed(cell, comma)
-    except ValueError:
-        raise UserError(f"{path}: line {line}: {cell!r} is not a number") from None
-    if not np.isfinite(found):
-        raise UserError(f"{path}: line {line}: {cell!r} is not a finite number; drop the line")
-    return found
-
-
 def meaning_of(name: str) -> tuple[str, str] | None:
     """The quantity under a name, and its unit as it is written; None where it is not known."""
     name = " ".join(name.replace("_", " ").split()).casefold()
     if name == "hz":
         return "f", "hz"
-    if name in NAMES:
+    if name in ("db", "deg"):
+        return ("size" if name == "db" else "angle"), name
+    if name in ANGULAR:
+        return "f", "rad/s"
+    if name in NAMES and name != "gain":  # which may be a factor
         return NAMES[name], ""
     bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", name)
     base, unit = bracket.groups() if bracket else name.split(" ", 1) if " " in name else (name, "")
-    if base not in NAMES:
+    if base not in NAMES or (base == "gain" and not unit):
         return None
     unit = "" if bracket and unit in _PLAIN else unit
     return NAMES[base], unit
+
+
+def rate_order(path: Path, name: str) -> int:
+    """Find of which derivative of a displacement a column of a response is.
+
+    Parameters
+    ----------
+    path, name : Path, str
+
+    Returns
+    -------
+    int
+        0: receptance, 1: mobility, 2: accelerance, by its name or its unit.
+
+    Raises
+    ------
+    UserError
+        Its name and its unit differ.
+    """
+    base = re.split(r"[ _(\[]", name.strip().casefold())[0]
+    found = meaning_of(name)
+    unit = found[1] if found else ""
+    named, stated = RATE_NAMES.get(base), RATES.get(unit)
+    if named is not None and unit not in ("", "db") and stated != named:
+        raise UserError(f"{path}: {name!r}: a {base} is not in {unit}; name what it is")
+    return named or stated or 0
 
 
 def _with_unit(path: Path, place: str, name: str, unit: str) -> str:

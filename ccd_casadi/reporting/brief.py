@@ -24,11 +24,12 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.reporting.decision import loop_concerns
 from ccd_casadi.reporting.facts import binding, cost_words, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.reporting.run_verdict import advice, lines_of, loop_concerns, unproven
+from ccd_casadi.reporting.run_verdict import advice, lines_of, unproven
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
 from surrogates.files import write_whole

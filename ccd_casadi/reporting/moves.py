@@ -217,6 +217,8 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     late = [m for m in made if np.isinf(m.settled)]
     when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"
+    if any(not m.finite for m in made):
+        return f"{name}: the simulation was lost, so whether it settles is not known"
     if late:
         when = "does not settle" if any(m.rest > m.window for m in late) else (
             f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"

@@ -4,20 +4,24 @@ import json
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictRow
 from ccd_casadi.drawing.paint import block_html, page_html, write_page
+from ccd_casadi.reporting.decision import (
+    current_concern,
+    limited_move,
+    limited_move_remedy,
+    loop_concerns,
+    resonance_condition,
+)
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped
-from ccd_casadi.support.text import with_unit
 from surrogates.files import write_whole
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
@@ -33,34 +37,10 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
     "loop": "a smaller S_max; with sections bandwidth_least_hz, least_damping or weighted_level",
 }
-USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
-    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
-    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
-    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
-)
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
-
-
-@dataclass(frozen=True)
-class ConcernOptions:
-    """Usual limits of a loop beside those of `USUAL`.
-
-    Attributes
-    ----------
-    slack : float
-        Relative: a design lies on its bounds, and 2 is the usual S_max.
-    overshoot : float
-        Of a step without feedforward.
-    between_lines : float
-        What |S| may reach between the lines of a response, over the largest on them.
-    """
-
-    slack: float = 0.01
-    overshoot: float = 0.5
-    between_lines: float = 1.1
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
@@ -188,9 +168,12 @@ def advice(result: Mapping[str, Any]) -> str:
         after = "more lines there, or more averages" if lines else "a smaller S_max"
         after = NEXT["current"] if looked_at == current_concern(result) else after
         return f"{words} Next: {after}." if looked_at else ""
+    stuck = limited_move(result)
+    also = f" Besides, {stuck}." if stuck else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
-        return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
+        step = _next_of_failed(failed[0], result) if failed else "see why"
+        return f"Do not build this: {why}.{also} Next: {step}."
     own = result["verdict"].get("survives", {}).get("set")
     unclosed = states.get("survives") == State.WARNED and own == OwnSet.UNPROVEN
     doubts = _doubts_of_kept_set(result) if own == OwnSet.KEPT else []
@@ -198,7 +181,7 @@ def advice(result: Mapping[str, Any]) -> str:
         words = "Do not build this: it does not survive small errors of its model."
         if own == OwnSet.NONE:
             words = "Do not build this yet: it was judged on the model alone."
-        return f"{words} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
+        return f"{words}{also} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
     warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else doubts
     warned += [
         f"{name} warned"
@@ -208,8 +191,12 @@ def advice(result: Mapping[str, Any]) -> str:
     if states.get("survives") == State.UNKNOWN:
         if unproven(result) == "not known":
             words = "Do not build this yet: what it survives is not known."
-            return f"{words} Next: {NEXT['survives']}."
+            return f"{words}{also} Next: {NEXT['survives']}."
         warned.append(f"the [robust] set is {unproven(result)}")
+    if stuck:
+        return f"Do not build this yet: {stuck}. Next: {limited_move_remedy(result)}."
+    condition = resonance_condition(result)
+    condition = condition and f" {condition}"
     budget = result.get("time_budget", {})
     if ended := bool(budget.get("ended")):
         warned.append(f"the search was ended by its budget of {budget['minutes']:g} min")
@@ -221,10 +208,16 @@ def advice(result: Mapping[str, Any]) -> str:
         steps += [NEXT["loop"]] * (len(looked_at) > len(of_motor))
         steps += [NEXT["budget"]] * ended
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
-        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after
-    return (
-        "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
-    )
+        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after + condition
+    later = " after deploy: hold and delay are not judged yet" if unjudged else ""
+    return f"Build this{later}.{condition}"
+
+
+def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
+    """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
+    line = result["verdict"][name]
+    rate_helps = line.get("needed_hz", 0.0) is not None
+    return NEXT[name] if name != "deployable" or rate_helps else "less delay"
 
 
 def _doubts_of_kept_set(result: Mapping[str, Any]) -> list[str]:
@@ -242,62 +235,6 @@ def _doubts_of_kept_set(result: Mapping[str, Any]) -> list[str]:
     poles = line.get("unstable_controller_poles_hz") or []
     at = ", ".join(f"{hz:.4g}" for hz in poles[:3])
     return [f"the controller is unstable by itself (poles at {at} Hz)"] if poles else []
-
-
-def loop_concerns(
-    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
-    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
-    and what is narrow or rings near the bandwidth, against the usual limits of the field.
-
-    The step does not count where the case names the move that the stage makes.
-    """
-    found = [
-        words.format(result[key])
-        for key, least, words in USUAL
-        if result.get(key) is not None and result[key] < (1.0 - options.slack) * least
-    ]
-    if "step_overshoot" in result and "move" not in result:
-        overshoot = result["step_overshoot"]
-        if overshoot > options.overshoot:
-            usual = f"usual: at most {100.0 * options.overshoot:g}"
-            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
-        settled, followed = result["settling_ms"], LoopFigureOptions().periods
-        if settled is None:
-            found.append("a step does not settle within 2 %")
-        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
-            late = f"only after {with_unit(1e-3 * settled, 's')}"
-            found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
-    reach = result.get("sensitivity_peak_between_lines")  # of a measured response
-    if reach is not None and reach > max(1.0, options.between_lines * result["sensitivity_peak"]):
-        where = result.get("sensitivity_peak_between_lines_hz")
-        at = "" if where is None else f" about {where:.4g} Hz"
-        found.append(f"|S| may reach {reach:.3g} between two lines{at}")
-    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
-
-
-def current_concern(
-    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
-    """What a move needs beyond the peak current of its motor; empty where it is enough.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    options : ConcernOptions
-
-    Returns
-    -------
-    list of str
-    """
-    move = result.get("move") or {}
-    share = move.get("needed_share")
-    if share is None or not share > 1.0 + options.slack:
-        return []
-    most = move["needed_current"] / share
-    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
-    return [f"{words}, and peak_current is {most:.4g} A"]
 
 
 def head_words(result: Mapping[str, Any]) -> str:

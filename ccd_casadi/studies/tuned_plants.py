@@ -17,6 +17,7 @@ from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
 from ccd_casadi.synthesis.matlab_systems import bare
+from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 Plant = MeasuredResponse | StateSpace
 
@@ -67,7 +68,10 @@ def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
         return item, delay
     if isinstance(item, interchange.NamedSystem):
         return item.system, delay + item.delay
-    return interchange.from_control(item), delay
+    found = interchange.from_control(item)
+    if not found.period and appears_discrete(found.A):  # 0 is the default of dt
+        tell(f"warning: {HINT}; give dt in s, or convert with d2c")
+    return found, delay
 
 
 def as_lines(

@@ -117,6 +117,7 @@ def tune(
     poles_at_zero: int | None = None,
     least_damping: float | None = None,
     rotary: bool = False,
+    spread: float = 1.0,
     starts: int = 24,
     seed: int = 0,
     progress: Tell | None = None,
@@ -144,6 +145,8 @@ def tune(
         lines), and the least damping ratio of a resonance that lines may hide (0.0005).
     rotary : bool
         Outputs are in rad and inputs in N m, in words and on pages; else m and N.
+    spread : float
+        Factor on the spread of responses: every bound holds for all plants within it.
     starts, seed : int
         Of the multi-start search.
     progress, workers
@@ -191,7 +194,8 @@ def tune(
         (item if isinstance(item, StateSpace) else replace(
             item, unstable_poles=unstable_poles or item.unstable_poles,
             poles_at_zero=item.poles_at_zero if poles_at_zero is None else poles_at_zero,
-            least_damping=least_damping or item.least_damping), late)
+            least_damping=least_damping or item.least_damping,
+            spread=None if item.spread is None or not spread else spread * item.spread), late)
         for item, late in known
     ]  # fmt: skip
     names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]

@@ -53,9 +53,29 @@ def spoken(words: str) -> str:
     words = re.sub(r"(?<!\w)([nµum]?)m(?!\w)", rf"\g<1>{output}", words)
     if force == "N":
         return words
-    words = re.sub(r"\bkg\b", "kg m²", words)
-    words = re.sub(r"/N\b", f"/({force})", words)
+    if force == "N m":
+        words = re.sub(r"\bkg\b", "kg m²", words)
+    words = re.sub(r"/N\b", f"/({force})" if " " in force else f"/{force}", words)
     return re.sub(r"(?<![\w(])([kMG]?)N\b", rf"\g<1>{force}", words)
+
+
+def is_force(unit: str) -> bool:
+    """Report whether the unit of an input is that of a force or a torque, which moves a mass.
+
+    Parameters
+    ----------
+    unit : str
+
+    Returns
+    -------
+    bool
+
+    Examples
+    --------
+    >>> is_force("N"), is_force("N m"), is_force("V")
+    (True, True, False)
+    """
+    return unit in ("N", "N m")
 
 
 def display_unit(unit: str, largest: float) -> tuple[str, float]:

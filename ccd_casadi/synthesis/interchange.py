@@ -25,6 +25,7 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.matlab_systems import PARTS, realised, strings, system_of, systems_in
+from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 if TYPE_CHECKING:
     import control  # a second to import: where it is called, and not before
@@ -149,6 +150,8 @@ def from_control(system: Any) -> StateSpace:
     parts = [np.array(getattr(system, part)) for part in PARTS]
     if any(np.iscomplexobj(part) or not np.isfinite(part).all() for part in parts):
         raise UserError("the state space has an entry that is not a finite real number")
+    if system.dt is None and appears_discrete(parts[0]):
+        raise UserError(f"dt is None, and {HINT}; give dt in s, or 0 of a continuous system")
     return StateSpace(*(part.astype(float) for part in parts), period=float(system.dt or 0.0))
 
 

@@ -21,6 +21,7 @@ from ccd_casadi.plants.table_columns import (
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 if TYPE_CHECKING:
     import control
@@ -301,6 +302,10 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     if Ts < 0.0:
         raise reader.fail("Ts", "is not a sampling period in s, or 0")
     many.append(f"sampled at {1.0 / Ts:.6g} Hz" if Ts else "continuous")
+    if not Ts and appears_discrete(A):
+        if fields.get("ts") is None:
+            raise reader.fail("Ts", f"is missing, and {HINT}; give Ts in s, or convert with d2c")
+        many.append(f"but {HINT}")
     if reader.given("InternalDelay"):
         raise reader.fail("InternalDelay", "is in the plant; approximate it (pade), or give lines")
     delay = reader.delay((p, m), Ts or unit, bool(Ts))

@@ -72,7 +72,7 @@ COMMANDS = sorted(
         for p in SOURCES
         if "\n@command(" in p.read_text()
     }
-    - {"ccd_casadi.imported", "ccd_casadi.tune"}  # take files of numbers, no case
+    - {f"ccd_casadi.{name}" for name in ("imported", "record", "tune")}  # take numbers, no case
 )
 
 

@@ -1,6 +1,9 @@
 """On the machine: feedforward, limits with back-calculation, a start without a jump, moves."""
 
+import json
+import re
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import control
@@ -16,7 +19,15 @@ from test_deploy_code import of_one_channel, random_controller
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
-from ccd_casadi.deployment.on_hardware import Electronics, SimulationOptions, move
+from ccd_casadi.deployment.on_hardware import (
+    BACK,
+    Electronics,
+    OnHardware,
+    SimulationOptions,
+    hardware_dict,
+    move,
+    on_hardware,
+)
 from ccd_casadi.deployment.realisation import (
     Realisation,
     back_calculation,
@@ -30,7 +41,9 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.reporting.moves import way_words
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.json_files import json_values
 
 PERIOD = DELAY = 1e-4
 CROSSOVER = 2.0 * np.pi * 40.0
@@ -235,3 +248,80 @@ def test_structured_text_is_the_c_code_line_by_line(
     rest = run_text(text, [*calls, {"RESET": True, "TAKEOVER": False}])[-1]["U"]
     again = difference_equation(found, errors[-1:], forwards[-1:])[0]
     np.testing.assert_array_equal(rest, again)
+
+
+@few(max_examples=50)
+@given(
+    size=st.integers(4, 60), data=st.data(), value=st.sampled_from([np.nan, np.inf, -np.inf]),
+    channels=st.integers(1, 2),
+)  # fmt: skip
+def test_a_simulation_that_is_lost_settles_nowhere(
+    size: int, data: st.DataObject, value: float, channels: int
+) -> None:
+    """At whichever instant; without it the same move has settled from the start."""
+    error = np.zeros((size, channels))
+    time = np.arange(size, dtype=float)
+    made = Move(time, time, error, error, False, 2.0, 1e-6)
+    assert made.finite
+    assert made.settled == 0.0
+    error[data.draw(st.integers(0, size - 1)), data.draw(st.integers(0, channels - 1))] = value
+    assert not made.finite
+    assert made.settled == np.inf
+    assert made.settling == np.inf
+    assert "not known" in way_words("a way", [made])
+
+
+@few(max_examples=60)
+@given(period=st.floats(1e-6, 1.0), times=st.floats(0.0, 3.0))
+def test_a_jitter_is_at_most_a_period_and_the_message_names_one_that_is_accepted(
+    period: float, times: float
+) -> None:
+    hardware = Electronics(jitter=times * period)
+    if hardware.jitter <= period:
+        hardware.require_in_order(period)
+        return
+    with pytest.raises(UserError, match=r"--jitter .*more than a period") as raised:
+        hardware.require_in_order(period)
+    most = float(re.search(r"at most (\S+) s", str(raised.value))[1])  # type: ignore[index]
+    assert 0.99 * period < most <= period
+    Electronics(jitter=most).require_in_order(period)
+
+
+def test_a_move_within_a_limit_settles_fails_or_is_not_known() -> None:
+    """The limited move of the loop as it is deployed decides, with the electronics where given."""
+    limits = MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4)
+    G, K = stage(), pid()
+    known = partial(on_hardware, G, delay=DELAY, bandwidth=CROSSOVER, limits=limits, window=1e-4)
+    assert known(K).limited_entry is None
+    peak = float(known(K).ways["with feedforward"].peak_force.max())
+
+    def entry(share: float, **more: Any) -> dict[str, Any]:
+        found = known(with_anti_windup(replace(K, saturation=share * peak), CROSSOVER), **more)
+        assert found.limited_entry is not None
+        return found.limited_entry
+
+    wide, narrow = entry(1.1), entry(0.02)
+    assert (wide["state"], narrow["state"]) == ("passed", "failed")
+    assert wide["settled"] < wide["time"]
+    assert narrow["settled"] is None
+    assert narrow["left"] > 1e-4
+    assert narrow["settles_unlimited"]
+    coarse = Electronics(sensor_step=1e-3)  # ten times the window
+    assert entry(1.1, hardware=coarse)["state"] == "failed"
+
+
+def test_a_move_that_leaves_double_precision_is_not_known() -> None:
+    """An unstable plant whose limit is too small to hold it."""
+    rate = 2000.0
+    A = np.array([[rate, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    B, C = np.array([[1.0], [0.0], [1.0]]), np.array([[1.0, 1.0, 0.0]])
+    G = StateSpace(A, B, C, np.zeros((1, 1)))
+    K = with_anti_windup(replace(pid(), saturation=1e-6), CROSSOVER)
+    made = move(G, K, DELAY, PROFILE)
+    assert not made.finite
+    found = OnHardware(PROFILE, 1e-6, None, {"feedback alone": made, BACK: made}, np.nan, 1e-6)
+    entry = found.limited_entry
+    assert entry is not None
+    assert (entry["state"], entry["left"]) == ("unknown", None)
+    assert json.dumps(json_values(entry), allow_nan=False)
+    assert json.dumps(json_values(hardware_dict(found)), allow_nan=False)

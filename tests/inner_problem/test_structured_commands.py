@@ -37,6 +37,8 @@ from ccd_casadi.limitations.limits import discs
 from ccd_casadi.limitations.multiplier import MultiplierBasis
 from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.reporting.decision import ConditionOptions
+from ccd_casadi.reporting.run_verdict import advice
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
@@ -203,6 +205,35 @@ def test_a_rate_that_only_the_nominal_plant_stands_is_not_verified(folder: Path)
     assert not found.passed
     assert found.worst.figures.sensitivity_peak > nominal
     assert "gain +2 %" in found.shortfalls[0]
+
+
+def test_resonances_that_the_set_does_not_shift_are_a_condition_of_the_decision(
+    folder: Path,
+) -> None:
+    """The set names an error of the gain alone: what the loop keeps is what must be known."""
+    result = json.loads((folder / "run" / "result.json").read_text())
+    line = result["verdict"]["survives"]
+    assert line["set_shift"] == [0.0, 0.0]
+    near = min(abs(end) for end in line["S_max_shift"]) < ConditionOptions().identified
+    before, condition, _ = advice(result).partition(" Condition: ")
+    assert before.startswith("Build this") or not condition
+    assert bool(condition) == (near and before.startswith("Build this"))
+
+
+def test_a_delay_beyond_that_of_the_design_is_the_cause_and_no_rate_is_the_remedy(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The rate that the loop has already does not make up for more delay; the own delay does."""
+    run, own = folder / "run", read_run(folder / "run").problem.sampling
+    assert own is not None
+    late = ["--delay-samples", str(6.0 * own.delay * own.rate_hz), "--out", str(tmp_path / "late")]
+    assert deploy_main([str(run), *late, *COMMON]) == 4
+    words = capsys.readouterr().err
+    assert f"the delay exceeds the {own.delay_us:g} us of the design" in words
+    assert f"{own.rate_hz:g} Hz is needed" not in words
+    assert json.loads((tmp_path / "late" / "deploy.json").read_text())["needed_rate_hz"] is None
+    kept = ["--delay", str(own.delay), "--out", str(tmp_path / "kept")]
+    assert deploy_main([str(run), *kept, *COMMON]) == 0
 
 
 def test_a_run_that_is_not_verified_deploys_as_such(

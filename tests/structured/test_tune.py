@@ -19,13 +19,15 @@ from test_measured import two_by_two
 import ccd_casadi as ccd
 from ccd_casadi import report
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.judgement import judge_lines
+from ccd_casadi.fixed_structure.judgement import judge_lines, judge_loops
 from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.studies import tuned_plants, tuning
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.interchange import from_control
 from ccd_casadi.tune import main
 from surrogates.lazy_names import from_stub
 
@@ -261,3 +263,34 @@ def test_a_rotary_plant_is_shown_in_its_own_units(tmp_path: Path) -> None:
     assert "N/m" not in page
     assert main([*words, "--out", str(tmp_path)]) == 0
     assert "N m/rad" not in (tmp_path / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def of_a_stage() -> tuple[StateSpace, ccd.Tuned]:
+    """A mass with a mode, and its controller."""
+    plant = control.ss(1.0 / (10.0 * s**2) + 0.02 / (s**2 + 20.0 * s + 2000.0**2))
+    return from_control(plant), ccd.tune(plant, rate_hz=8000.0, starts=2)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-6, 5.3e-5, -5.3e-5, 1e-3, 0.02, -0.02, 0.5, -0.5, 9.0])
+def test_what_is_written_is_judged_however_far_it_is_from_the_controller(
+    of_a_stage: tuple[StateSpace, ccd.Tuned], off: float
+) -> None:
+    """Rounding of the code is no reason to refuse it, a bound or a bandwidth that is lost is."""
+    plant, found = of_a_stage
+    K, bounds, rate = found.controller, found.case.bounds, 8000.0
+    assert K is not None
+    assert found.design.usable
+    right = tuning.realised(tustin(K, 1.0 / rate)).as_coded
+    coded = replace(right, C=(1.0 + off) * right.C, D=(1.0 + off) * right.D)
+    judge = judge_loops([plant], K, coded, bounds, Sampling(rate), found.design.bandwidth, True)
+    peak = judged(control.ss(*(getattr(plant, part) for part in "ABCD")),
+                  replace(K, C=(1.0 + off) * K.C, D=(1.0 + off) * K.D), rate)  # fmt: skip
+    if abs(off) <= 1e-3:  # within what the search leaves of S_max, and of the bandwidth
+        assert peak <= bounds.S_max
+        assert judge.passed
+    if not peak <= bounds.S_max * (1.0 + 1e-4) or off <= -0.02:
+        assert judge.passed is False
+    assert ("coefficients of the code" in judge.words) == (abs(off) > 1e-5 and np.isfinite(peak))
+    if np.isfinite(peak):
+        assert judge.figures["S_max"] * bounds.S_max == pytest.approx(peak, rel=1e-3)

@@ -1,0 +1,155 @@
+"""What the names of a log's columns mean: time, excitation, force, position, and their units."""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from ccd_casadi.support.errors import UserError
+
+ROLES: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "timestamp", "seconds"),
+    "excitation": (
+        "injected", "injection", "inject", "excitation", "excitation force", "disturbance", "noise",
+        "reference", "ref", "setpoint", "r", "noiseout", "sweep", "chirp",
+    ),
+    "force": (
+        "force", "force command", "command", "control", "u", "torque", "torque command", "thrust",
+        "servoout", "controller output", "input", "voltage",
+    ),
+    "position": (
+        "position", "pos", "y", "displacement", "encoder", "actual position", "actpos", "angle",
+        "output", "x",
+    ),
+}  # fmt: skip
+OPTIONS = {"time": "--time", "excitation": "--injected or --reference", "force": "--force",
+           "position": "--position"}  # fmt: skip
+REFERENCES = ("reference", "ref", "setpoint")
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "force": {"n": 1.0, "mn": 1e-3, "kn": 1e3, "n m": 1.0, "nm": 1.0, "n*m": 1.0, "v": 1.0},
+    "position": {
+        "m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0, "mrad": 1e-3,
+        "urad": 1e-6, "µrad": 1e-6,
+    },
+}  # fmt: skip
+SI = {"time": "s", "force": "N", "position": "m"}
+
+
+def unit_factor(text: str) -> float | None:
+    """Find the factor of a cell that holds a unit alone.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    float or None
+        None: it is not a unit.
+
+    Examples
+    --------
+    >>> unit_factor("[ms]"), unit_factor("speed")
+    (0.001, None)
+    """
+    plain = _plain(text.strip("[]() "))
+    if plain in ("", "-", "1"):
+        return 1.0
+    return next((units[plain] for units in UNITS.values() if plain in units), None)
+
+
+def _plain(text: str) -> str:
+    micro = text.replace("\N{GREEK SMALL LETTER MU}", "µ")
+    return " ".join(micro.replace("_", " ").split()).casefold()
+
+
+def parted(name: str) -> tuple[str, str]:
+    """Part the name of a column from its unit.
+
+    Parameters
+    ----------
+    name : str
+        Such as "Position [mm]" or "position_mm".
+
+    Returns
+    -------
+    str, str
+        Both in small letters; the second is empty where there is no unit.
+
+    Examples
+    --------
+    >>> parted("Position [mm]"), parted("force_command"), parted("pos_um")
+    (('position', 'mm'), ('force command', ''), ('pos', 'um'))
+    """
+    plain = _plain(name)
+    bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", plain)
+    if bracket:
+        return bracket[1], bracket[2]
+    base, _, last = plain.rpartition(" ")
+    if base and any(last in units for units in UNITS.values()):
+        return base, last
+    return plain, ""
+
+
+def column_of(path: Path, role: str, names: Iterable[str], stated: str | None) -> str | None:
+    """Find the column of a role.
+
+    Parameters
+    ----------
+    path, role : Path, str
+        Of ROLES.
+    names : iterable of str
+        Of all columns.
+    stated : str or None
+        By an option.
+
+    Returns
+    -------
+    str or None
+        None: no column has a name of it.
+
+    Raises
+    ------
+    UserError
+        The column that is stated is not there, or two columns may be meant.
+    """
+    names = list(names)
+    if stated is not None:
+        exact = [name for name in names if stated in (name, parted(name)[0])]
+        if len(exact) != 1:
+            words = "is there more than once" if exact else "is not there"
+            raise UserError(f"{path}: column {stated!r} {words}; it has {', '.join(names)}")
+        return exact[0]
+    found = [name for name in names if parted(name)[0] in ROLES[role]]
+    if len(found) > 1:
+        both = " or ".join(repr(name) for name in found)
+        raise UserError(f"{path}: the {role} may be {both}; state which with {OPTIONS[role]}")
+    return found[0] if found else None
+
+
+def factor_of(path: Path, role: str, name: str) -> tuple[float, str]:
+    """Find the factor of a column to SI by the unit in its name.
+
+    Parameters
+    ----------
+    path, role, name : Path, str, str
+
+    Returns
+    -------
+    float, str
+        The unit in words; "m, as no unit is named" where there is none.
+
+    Raises
+    ------
+    UserError
+        The unit is not one of the role.
+    """
+    unit = parted(name)[1]
+    if unit in ("", "-", "1"):
+        return 1.0, f"{SI[role]}, as no unit is named"
+    known = UNITS[role]
+    if unit not in known:
+        raise UserError(f"{path}: {name!r}: the unit {unit!r} is not one of a {role}; it may be "
+                        f"{', '.join(known)}")  # fmt: skip
+    written = re.search(re.escape(unit), name, re.IGNORECASE)
+    return known[unit], written[0] if written else unit

@@ -1,0 +1,103 @@
+"""What a decision names besides the five lines: a move that does not settle, what must be known."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles.helpers import few
+
+from ccd_casadi.codesign.verdict import OwnSet
+from ccd_casadi.reporting.brief import risks
+from ccd_casadi.reporting.decision import ConditionOptions, resonance_condition
+from ccd_casadi.reporting.run_verdict import advice
+
+LINES = ("certified", "optimal", "predicted", "survives", "deployable")
+
+
+def result_of(**states: str) -> dict:
+    lines = {name: {"state": states.get(name, "passed"), "words": name} for name in LINES}
+    return {"status": "verified", "verdict": lines}
+
+
+def moved(state: str, unlimited: bool = True) -> dict:
+    """The figures of a move within 50 N."""
+    return {
+        "state": state, "force_limit": 50.0, "settled": 0.2 if state == "passed" else None,
+        "time": 0.72, "left": 3e-6 if state == "failed" else None, "settles_unlimited": unlimited,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "states",
+    [{}, {"predicted": "warned"}, {"survives": "warned"}, {"deployable": "warned"},
+     {"optimal": "failed"}, {"survives": "unknown"}],
+)  # fmt: skip
+def test_a_move_that_does_not_settle_within_its_limit_is_in_every_decision(states: dict) -> None:
+    result = result_of(**states)
+    before = advice(result)
+    result["verdict"]["deployable"]["move"] = moved("passed")
+    assert advice(result) == before
+    for state, said in (("failed", "the move has not settled"), ("unknown", "is not known")):
+        result["verdict"]["deployable"]["move"] = moved(state)
+        words = advice(result)
+        assert words.startswith("Do not build this")
+        assert said in words
+        assert "50 N" in words
+        assert "Next: " in words
+        if before.startswith("Do not"):  # whose reason stays the first
+            assert words.startswith(before.partition(".")[0])
+
+
+def test_a_larger_limit_is_no_remedy_where_the_move_does_not_settle_without_one() -> None:
+    result = result_of()
+    for unlimited in (True, False):
+        result["verdict"]["deployable"]["move"] = moved("failed", unlimited)
+        assert ("larger --saturation" in advice(result)) == unlimited
+
+
+def test_a_rate_is_next_only_where_a_rate_is_enough() -> None:
+    result = result_of(deployable="failed")
+    for needed, said in ((8000.0, "a higher rate"), (None, "Next: less delay.")):
+        result["verdict"]["deployable"]["needed_hz"] = needed
+        assert said in advice(result)
+
+
+SHIFTS = st.floats(0.0, 0.3)
+
+
+@few(max_examples=100)
+@given(low=SHIFTS, high=SHIFTS, held=st.sampled_from([0.0, 0.01, 0.03]))
+def test_resonances_that_must_be_known_are_a_condition_unless_the_set_holds_their_error(
+    low: float, high: float, held: float
+) -> None:
+    result = result_of()
+    result["verdict"]["survives"] |= {
+        "set": OwnSet.KEPT, "robust_set": True, "S_max_shift": [-low, high],
+        "set_shift": [-held, held],
+    }  # fmt: skip
+    words, known = advice(result), ConditionOptions().identified
+    assert words.startswith("Build this.")  # what scripts compare with
+    assert ("Condition: " in words) == (held == 0.0 and min(low, high) < known)
+    for sentence in words.split(". "):
+        assert len(sentence.split()) <= 25
+    if "Condition: " in words:
+        for text in re.findall(r"[-+]?[\d.]+(?= (?:%|to))", words):
+            assert abs(float(text)) <= 100.0 * max(low, high) + 1e-9  # never more than is kept
+        assert any("identify them that well" in risk for risk in risks(result))
+
+
+def test_an_older_run_names_no_condition_and_other_decisions_name_it_too() -> None:
+    shift = {"S_max_shift": [-0.012, 0.3]}
+    result = result_of()
+    result["verdict"]["survives"] |= shift
+    assert advice(result) == "Build this."
+    said = "Condition: no resonance is more than 1.2 % below its model; else |S| exceeds S_max."
+    for states in ({}, {"predicted": "warned"}, {"deployable": "unknown"}):
+        result = result_of(**states)
+        result["verdict"]["survives"] |= {**shift, "set_shift": [0.0, 0.0]}
+        assert resonance_condition(result) == said
+        assert advice(result).endswith(f" {said}")
+    failed = result_of(optimal="failed")
+    failed["verdict"]["survives"] |= {**shift, "set_shift": [0.0, 0.0]}
+    assert "Condition" not in advice(failed)
