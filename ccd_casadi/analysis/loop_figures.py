@@ -21,7 +21,8 @@ from ccd_casadi.analysis.loop_warnings import (
     second_crossover,
     second_crossover_of,
 )
-from ccd_casadi.lti.loop import BreakPoint, Loop, Sampling, constant_drive
+from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ

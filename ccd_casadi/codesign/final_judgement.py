@@ -28,11 +28,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structured_of,
-    uncertain_plant,
-)
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of, uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation

@@ -10,7 +10,8 @@ import scipy
 
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.loop import BreakPoint, Loop, Sampling, tustin
+from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.loop import Loop, Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import (
     FREE,

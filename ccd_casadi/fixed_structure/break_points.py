@@ -146,7 +146,9 @@ class LoopNumbers:
         beside = GUARD * (total + above + np.abs(self.y) + np.abs(begin))
         beside += self.beside(np.abs(self.gains) + self.of_gains)
         if not of_y:  # K_j of N moves apart from K̂_j of D
-            beside += (moved * kept * seen).sum(axis=1) + self.beside((np.abs(gains) + moved) * kept)
+            beside += (moved * kept * seen).sum(axis=1) + self.beside(
+                (np.abs(gains) + moved) * kept
+            )
         first, last = (begin, self.y) if not at_rest else (0.0, 0.0)
         if at_rest:
             beside += self.most_of_y**2 * (self.most_of_y + (0.0 if of_y else 1.0))
@@ -199,7 +201,9 @@ class SensorFamily(LoopFamily):
         figures = [one.enclosed() for one in (*each, at_actuator)]
         S, over_y = figures[error][:2], figures[error][0]
         if self._integrator:  # S/y, near 0 Hz
-            over_y = numbers.fraction((np.arange(count) != error).astype(float), False).enclosed()[0]
+            over_y = numbers.fraction((np.arange(count) != error).astype(float), False).enclosed()[
+                0
+            ]
         found = self._of_S(boxes, S, over_y)
         for own, figure in zip(self.bounds.channels, figures, strict=True):
             limit = (own.S_max or self.bounds.S_max) * inside
@@ -207,7 +211,9 @@ class SensorFamily(LoopFamily):
         if self.bounds.weighted_level is not None:
             own = (np.arange(count) == error).astype(float)
             T = numbers.fraction(own, True, ahead=False).enclosed()[:2]
-            found += self._weighted(boxes, self.bounds.weighted_level, _force(numbers, at_actuator), T)
+            found += self._weighted(
+                boxes, self.bounds.weighted_level, _force(numbers, at_actuator), T
+            )
         if self.bounds.compliance_max is not None:
             upper, lower = _compliance(numbers, at_actuator, free, error)
             limit = self.bounds.compliance_max * inside
@@ -234,10 +240,13 @@ class SensorFamily(LoopFamily):
                 for rows in (gains, plain))  # fmt: skip
         finite = np.isfinite(held.middle + held.radius).all(axis=0) & np.isfinite(y[0] + y[1])
         finite &= np.isfinite(K[0] + K[1] + P[0] + P[1]).all(axis=1)
-        parts = [np.asarray(np.where(finite, part.T, 0.0).T)
-                 for part in (*y, held.middle.T, held.radius.T, *K, *P)]  # fmt: skip
+        known = (*y, held.middle.T, held.radius.T, *K, *P)
+        y_c, delta_y, m, r, k, of_k, p, of_p = (
+            np.asarray(np.where(finite, part.T, 0.0).T) for part in known
+        )
         terms = (self.plant.drive @ self.inputs) * (self.plant.reading @ self.outputs)
-        return LoopNumbers(*parts, terms, self.plant.rigid if at_rest else None), finite
+        rigid = self.plant.rigid if at_rest else None
+        return LoopNumbers(y_c, delta_y, m, r, k, of_k, p, of_p, terms, rigid), finite
 
     def _spread(self, held: Discs, finite: np.ndarray, moved: Array, of_all: Fraction) -> Array:
         """How much each coordinate moves the loop (1 + n_p, N)."""

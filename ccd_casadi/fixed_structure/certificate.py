@@ -309,8 +309,8 @@ def _raised(
     KS = StateSpace(loop.A, loop.B, of_u, K.D)
     T = StateSpace(loop.A, loop.B, of_y, np.zeros((p, p)))
     if bounds.error is not None:
-        one = bounds.channels[bounds.error]
-        T, of_y = _entry(one, T), np.array([one.output]) @ of_y
+        counts = bounds.channels[bounds.error]
+        T, of_y = _entry(counts, T), np.array([counts.output]) @ of_y
         p = 1
     systems = {"KS": KS, "T": T}
     if period is None:

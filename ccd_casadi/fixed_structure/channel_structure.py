@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy
@@ -111,7 +112,7 @@ def given_decoupling(
 
 
 def channel_bounds(
-    decoupling: Decoupling, given: Mapping[str, Mapping[str, float]]
+    decoupling: Decoupling, given: Mapping[str, Mapping[str, Any]]
 ) -> tuple[ChannelBounds, ...]:
     """Make the `channels` of `Bounds` from the bounds of single channels.
 

@@ -24,11 +24,7 @@ from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.structured_problem import (
-    ChannelProblem,
-    StructuredProblem,
-    of_sensor,
-)
+from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem, of_sensor
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -97,10 +93,10 @@ def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
     """The channels' own, where they are tighter than the whole's; none where none is."""
     structured = structured_of(problem)
     if structured.bandwidth_of is not None:
-        structure = structure_of(problem)
-        assert isinstance(structure, ChannelStructure)
+        sensors = structure_of(problem)
+        assert isinstance(sensors, ChannelStructure)
         own_peaks = {c.name: c.S_max for c in structured.channels if c.S_max is not None}
-        return sensors_on_one_actuator(structure.decoupling, problem.inner.S_max, own_peaks)
+        return sensors_on_one_actuator(sensors.decoupling, problem.inner.S_max, own_peaks)
     whole = {"S_max": problem.inner.S_max, "M_K": problem.weights.M_K}
     given = {}
     for channel in structured.channels:

@@ -1,4 +1,4 @@
-"""A ball-screw axis with two encoders, in metres of table travel: one on the motor, one at the table.
+"""A ball-screw axis with an encoder on the motor and one at the table, in metres of travel.
 
 The screw's diameter d makes it stiff and heavy to turn, its lead r makes the motor's inertia count
 for less. x = [motor, table]; the inertia J of motor and screw counts as J (2π/lead)².
