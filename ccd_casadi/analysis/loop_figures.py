@@ -243,8 +243,6 @@ def measured_entry(
         SI.
     bandwidth, sensitivity_peak : float
         ω_b in rad/s, and ‖S‖∞.
-    places : tuple of BreakPoint
-        Of several sensors on one actuator; margins are the least of all places.
     options : LoopFigureOptions
         Of steps and warnings.
 

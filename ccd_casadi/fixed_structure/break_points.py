@@ -153,10 +153,11 @@ class LoopNumbers:
         if at_rest:
             beside += self.most_of_y**2 * (self.most_of_y + (0.0 if of_y else 1.0))
         in_y = 0.0 if at_rest else 1.0
+        y_above = in_y * float(of_y and ahead) * one
         return Fraction(
             first + (self.middle * of_above).sum(axis=1),
             last + (self.middle * of_below).sum(axis=1),
-            np.concatenate([of_above, kept * float(of_y) * one, in_y * float(of_y and ahead) * one], axis=1),
+            np.concatenate([of_above, kept * float(of_y) * one, y_above], axis=1),
             np.concatenate([of_below, np.ones_like(seen), in_y * one], axis=1),
             np.concatenate([self.radius, self.of_gains * seen, self.delta_y[:, None]], axis=1),
             beside,
@@ -165,7 +166,7 @@ class LoopNumbers:
 
 @dataclass(frozen=True)
 class SensorFamily(LoopFamily):
-    """One option's loops of several sensors on one actuator; see `LoopFamily` and `Bounds.error`."""
+    """One option's loops of several sensors on one actuator; see `Bounds.error`."""
 
     @property
     def _error(self) -> int:

@@ -85,7 +85,8 @@ def given_decoupling(
     """The channels that a case gives by directions, which are brought to length 1.
 
     There may be fewer outputs than channels (several actuators on one sensor: `[[1], [1]]`), or one
-    input for all channels (several sensors on one actuator: `[[1], [1]]` again). Raises PlantError where directions are zero, not of one length, or do not span all outputs and inputs.
+    input for all channels (several sensors on one actuator: `[[1], [1]]` again). Raises PlantError
+    where directions are zero, not of one length, or do not span all outputs and inputs.
     """
     found = []
     for word, rows in (("outputs", outputs), ("inputs", inputs)):
@@ -316,7 +317,7 @@ class ChannelStructure:
         return all(structure.integrator for structure in self.structures)
 
     def integrates(self, error: int | None) -> bool:
-        """Whether S falls to zero towards 0 Hz; of the channel whose `error` counts, if one does."""
+        """Whether S falls to zero towards 0 Hz, that of the channel whose `error` counts."""
         return self.integrator if error is None else self.structures[error].integrator
 
     def owner(self, number: int) -> int:

@@ -22,9 +22,9 @@ from ccd_casadi.fixed_structure.bounds import Bounds, Place, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.plant_set import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.loop_point import AT_ACTUATOR, AT_SENSOR, COUNTED_ROW, LoopArrays
+from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
-from ccd_casadi.kernels.sections import HALF_POWER, Limit, LoopCurve
+from ccd_casadi.kernels.sections import HALF_POWER, GainOf, Limit, LoopCurve
 from ccd_casadi.lti.frequency_grid import root_flanks
 from ccd_casadi.support.arrays import Array
 
@@ -226,7 +226,7 @@ class LoopProblem:
     @cached_property
     def _kinds(self) -> np.ndarray:
         """Kinds of the channels' own gains, as the kernels have them."""
-        kinds = {Place.WHOLE: COUNTED_ROW, Place.SENSOR: AT_SENSOR, Place.ACTUATOR: AT_ACTUATOR}
+        kinds = {Place.WHOLE: GainOf.ROW, Place.SENSOR: GainOf.SENSOR, Place.ACTUATOR: GainOf.ACTUATOR}
         return np.array([kinds[one.place] for one in self.bounds.channels], np.int64)
 
     def plants_of(self, constraints: "RowPlaces") -> np.ndarray:

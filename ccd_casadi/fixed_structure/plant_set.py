@@ -102,8 +102,8 @@ class LoopPlant:
 
 @dataclass(frozen=True)
 class PlantSet:
-    """All plants, p x m with p <= m or m = 1, in the units of the first: ω₀ in rad/s, force in N/m; T and τ
-    in 1/ω₀.
+    """All plants, p x m with p <= m or m = 1, in the units of the first: ω₀ in rad/s, force in N/m;
+    T and τ in 1/ω₀.
 
     `poles` (P, n) and `residues` (P, n, p, m) are those of the continuous plants, the shorter ones
     with zeros. At a pole 0 the residue's imaginary part is that of 1/s². `out` = Uᵀ (c, p) and

@@ -6,8 +6,6 @@ import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.loop_point import (
-    AT_ACTUATOR,
-    COUNTED_ROW,
     FREE,
     GV,
     LEFT,
@@ -27,7 +25,13 @@ from ccd_casadi.kernels.loop_point import (
     row_of,
 )
 from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import LoopCurve, gains_and_slopes, second_slopes, warped
+from ccd_casadi.kernels.sections import (
+    GainOf,
+    LoopCurve,
+    gains_and_slopes,
+    second_slopes,
+    warped,
+)
 
 
 class Answers(NamedTuple):
@@ -218,9 +222,9 @@ def second(curve, number, which, v, loop):
             response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
         σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
-        kind = broken(curve[j], kinds[number[j] - p]) if number[j] >= p else COUNTED_ROW
+        kind = broken(curve[j], kinds[number[j] - p]) if number[j] >= p else GainOf.ROW
         columns = m if curve[j] == LoopCurve.GS else p
-        if kind != COUNTED_ROW:  # one entry of S has no other singular value
+        if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1
         _by_channel(curve[j], number[j], kind, place, into, p, own, at, of, crossed, moved, back,
                     ahead)  # fmt: skip
@@ -258,10 +262,10 @@ def _by_channel(curve, number, kind, place, into, p, own, at, of, crossed, moved
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
-    (m, c), at_actuator = into.shape, kind == AT_ACTUATOR
+    (m, c), at_actuator = into.shape, kind == GainOf.ACTUATOR
     of_force = curve == LoopCurve.KS or at_actuator
     rows, columns = m if of_force else p, m if curve == LoopCurve.GS else p
-    columns = 1 if kind != COUNTED_ROW else columns
+    columns = 1 if kind != GainOf.ROW else columns
     z = np.complex128
     w = max(m, p)
     R, P, Q = np.zeros((c, c), z), np.zeros((w, c), z), np.zeros((w, c), z)

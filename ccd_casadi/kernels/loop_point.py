@@ -7,12 +7,19 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.linear_algebra import invert, largest_gain, singular
 from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import LoopCurve, gains, gains_and_slopes, inverse, offset, warped
+from ccd_casadi.kernels.sections import (
+    GainOf,
+    LoopCurve,
+    gains,
+    gains_and_slopes,
+    inverse,
+    offset,
+    warped,
+)
 
 # What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (9, w)
 G, DG, FREE, DFREE, GV, GK, S, US, M, V = range(10)  # GV = G V, US = Uᵀ S
 K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y = range(9)  # K_i, ∂ln K_i/∂ln v; U = ũ, W = v or G₀ v
-COUNTED_ROW, AT_SENSOR, AT_ACTUATOR = range(3)  # kinds of a channel's own gain, see `LoopArrays`
 
 
 class LoopArrays(NamedTuple):
@@ -34,8 +41,7 @@ class LoopArrays(NamedTuple):
         Rows uᵀ of S and wᵀ of KS that channels bound for themselves, and directions r of a
         reference, in the plants' coordinates.
     kinds : int array (channels,)
-        Of these: COUNTED_ROW ‖uᵀS‖; where the loop is broken in one place alone AT_SENSOR |uᵀS r|
-        and AT_ACTUATOR |wᵀ(I + KG)⁻¹w|.
+        Of these, `sections.GainOf`.
     """
 
     factors: Any
@@ -139,14 +145,14 @@ def row_of(row, M, rows, columns):
 @compiled
 def broken(curve, kind):
     """Kind of a gain: where the loop is broken it is of S and T, other curves count rows."""
-    return kind if curve != LoopCurve.KS and curve != LoopCurve.GS else COUNTED_ROW
+    return kind if curve != LoopCurve.KS and curve != LoopCurve.GS else GainOf.ROW
 
 
 @compiled
 def own_gain(curve, i, into, out, k, own, kinds, at):
     """Gain of channel i's own; its row is in M's first row, of one place its entry."""
     (m, c), p, kind = into.shape, out.shape[1], broken(curve, kinds[i])
-    if kind == AT_ACTUATOR:  # (I + KG)⁻¹ = I - K S G, K = V diag(K_i) Uᵀ
+    if kind == GainOf.ACTUATOR:  # (I + KG)⁻¹ = I - K S G, K = V diag(K_i) Uᵀ
         for a in range(m):
             for b in range(m):
                 total = 1.0 + 0.0j if a == b else 0.0j
@@ -159,8 +165,8 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
         rows, columns = m, m
     else:
         rows, columns = matrix(curve, into, out, k, at)
-    length = row_of(own[int(curve == LoopCurve.KS or kind == AT_ACTUATOR), i], at[M], rows, columns)
-    if kind == COUNTED_ROW:
+    length = row_of(own[int(curve == LoopCurve.KS or kind == GainOf.ACTUATOR), i], at[M], rows, columns)
+    if kind == GainOf.ROW:
         return length
     entry = 0.0j
     for b in range(columns):
@@ -173,7 +179,7 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
 def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
     (m, c), p = into.shape, out.shape[1]
-    kind, place = COUNTED_ROW, number
+    kind, place = GainOf.ROW, number
     columns = m if curve == LoopCurve.GS else p
     rows = m if curve == LoopCurve.KS else p
     if number < p:
@@ -182,14 +188,14 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
     else:
         place, kind = 0, broken(curve, kinds[number - p])
         size = own_gain(curve, number - p, into, out, of[K], own, kinds, at)
-        if kind == COUNTED_ROW:
+        if kind == GainOf.ROW:
             singular(at[M], 1, columns, at[V], sigma, True)
         else:
-            columns = rows = m if kind == AT_ACTUATOR else p
+            columns = rows = m if kind == GainOf.ACTUATOR else p
             sigma[0] = size
             for b in range(columns):
                 at[V, b, 0] = own[2, number - p, b]
-    at_actuator = kind == AT_ACTUATOR
+    at_actuator = kind == GainOf.ACTUATOR
     scale = 1.0 / (sigma[place] * sigma[place])
     for a in range(rows):
         if number < p:

@@ -68,6 +68,22 @@ class Limit(IntEnum):
     COUNT = 15
 
 
+class GainOf(IntEnum):
+    """What a channel's own gain is of S, and where the loop is broken at one place alone.
+
+    Attributes
+    ----------
+    ROW
+        ‖uᵀS‖.
+    SENSOR, ACTUATOR
+        |uᵀS r|, and |wᵀ(I + KG)⁻¹w|.
+    """
+
+    ROW = 0
+    SENSOR = 1
+    ACTUATOR = 2
+
+
 @compiled
 def warped(T, v):
     """ω = (2/T) arctan(T v/2) and ∂ln ω/∂ln v of a loop with period T (0: continuous, ω = v).
