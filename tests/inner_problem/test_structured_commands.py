@@ -73,6 +73,8 @@ delay_us = 80.0
 gain = 0.02
 [sampling]
 points = 2
+[outer]
+box_points = 0
 """
 
 
@@ -205,6 +207,7 @@ def test_a_rate_that_only_the_nominal_plant_stands_is_not_verified(folder: Path)
     assert "gain +2 %" in found.shortfalls[0]
 
 
+@pytest.mark.slow  # of mixed sensitivity it is in test_deploy_robust
 def test_a_run_that_is_not_verified_deploys_as_such(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
