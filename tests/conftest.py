@@ -127,6 +127,12 @@ def nannies(tmp_path: Path) -> Iterator[Any]:
         processes.kill()
 
 
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of this process without pictures, whose painting takes a second or two a page."""
+    monkeypatch.setattr("ccd_casadi.drawing.charts.to_svg", lambda *_: "")
+
+
 @pytest.fixture  # of one test: other event loops cannot run in this thread beside the browser's
 def browser() -> Iterator[Any]:
     """Headless Chromium, where there is one."""
