@@ -9,7 +9,7 @@ export OMP_NUM_THREADS := 1
 export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test tests test-fast test-room test-pythons test-processors lint docs bench peers setup setup-test clean
+.PHONY: solve test tests studies test-fast test-room test-pythons test-processors lint docs bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
@@ -21,6 +21,10 @@ test: setup-test
 tests: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 	$(BIN)/python benchmarks/processors.py --other
+
+# The heavier studies that `make test` leaves out: half an hour on two cores.
+studies: setup-test
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 # The room that one works in, a folder of tests/: `make test-fast ROOM=kernels`, under a minute each.
 ROOM ?= kernels

@@ -3,7 +3,6 @@
 import fcntl
 import gc
 import os
-import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -38,8 +37,6 @@ for profile, repeat in (("same", True), ("study", False)):
     )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
 
 def pytest_collection_finish() -> None:
     """What is collected lasts: without this the garbage collector walks it a thousand times."""
@@ -73,7 +70,8 @@ def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], A
 
 @pytest.fixture(scope="session")
 def solved(common_folder: Callable[[str], Any]) -> Callable[[str], Path]:
-    """The run folder of case study 1 in a formulation; it is not to be changed."""
+    """The run folder of case study 1 in a formulation, its pages where that is "lifted"; it is
+    not to be changed."""
 
     def solve(formulation: str) -> Path:
         from oracles.commands import run
@@ -81,7 +79,8 @@ def solved(common_folder: Callable[[str], Any]) -> Callable[[str], Path]:
         with common_folder(f"two_mass_{formulation}") as place:
             folder: Path = place / "run"
             if not folder.exists():
-                assert run(place / "making", "--formulation", formulation) == 0
+                pages = [] if formulation == "lifted" else ["--no-report"]
+                assert run(place / "making", "--formulation", formulation, *pages) == 0
                 (place / "making").rename(folder)
         return folder
 
@@ -128,14 +127,16 @@ def nannies(tmp_path: Path) -> Iterator[Any]:
         processes.kill()
 
 
-@pytest.fixture  # of one test: while Playwright is open its event loop runs in this thread
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of this process without pictures, whose painting takes a second or two a page."""
+    monkeypatch.setattr("ccd_casadi.drawing.charts.to_svg", lambda *_: "")
+
+
+@pytest.fixture  # of one test: other event loops cannot run in this thread beside the browser's
 def browser() -> Iterator[Any]:
     """Headless Chromium, where there is one."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    place = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if place is None:
-        pytest.skip(f"none of {', '.join(BROWSERS)} is installed: the page is not driven")
-    with api.sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=place, args=["--no-sandbox"])
+    from oracles.chromium import chromium
+
+    with chromium() as made:
         yield made
-        made.close()

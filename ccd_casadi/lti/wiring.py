@@ -117,6 +117,8 @@ class Wiring:
 
     def around(self, plant: StateSpace) -> StateSpace:
         """The plant (p x m, time in s) with its actuators and sensors."""
+        if not self:
+            return plant
         p, m = len(plant.C), plant.B.shape[1]
         wired = self.actuator.system(m, "actuator").series(plant)
         return wired.series(self.sensor.system(p, "sensor"))

@@ -86,7 +86,7 @@ def test_a_tighter_tolerance_goes_on_from_the_samples(copy: Path) -> None:
 
 def test_a_run_keeps_the_name_of_its_formulation(tmp_path: Path) -> None:
     """A `direct` run was called `lifted` once it had been trained again."""
-    _, (solution,) = job(tmp_path, "direct")
+    _, (solution,) = job(tmp_path, "direct", budget=FIRST + 1)
     assert solution.result["formulation"] == "direct"
 
 

@@ -1,5 +1,8 @@
 """A plant that is a Python callable: the same plant as its file, in this process and in others."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -112,3 +115,24 @@ def test_the_library_computes_with_one_blas_thread() -> None:
     assert {count for each in seen for count in each.values()} == {1}
     assert 2 in before.values()  # not every BLAS takes more than one
     assert before.items() <= after.items()  # another test may have another library loaded
+
+
+def test_a_library_that_comes_with_a_module_is_limited_too() -> None:
+    """In a process of its own, where SciPy with its own BLAS is imported after the first limit."""
+    words = (
+        "import numpy, sys\n"
+        "from threadpoolctl import threadpool_info\n"
+        "from ccd_casadi.support.worker_process import one_blas_thread\n"
+        "with one_blas_thread: pass\n"
+        "known = len(threadpool_info())\n"
+        "import scipy.linalg\n"
+        "with one_blas_thread:\n"
+        "    print(known, *(found['num_threads'] for found in threadpool_info()))\n"
+    )
+    env = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", words], env=env, capture_output=True, text=True, check=True
+    )
+    known, *threads = map(int, done.stdout.split())
+    assert known < len(threads)
+    assert set(threads) == {1}

@@ -6,15 +6,15 @@ import re
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
+from itertools import chain
 
 import pytest
+from oracles.sources import ROOT, SOURCES, nodes
 
 from ccd_casadi.__main__ import COMMANDS
 from ccd_casadi.reporting.run_verdict import FILES
 from ccd_casadi.support.text import package_text
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 USERS = sorted(page for page in DOCS.rglob("*.md") if "development" not in page.parts)
 MENTIONS = ("README.md", "CONTRIBUTING.md", "pyproject.toml", "Makefile", "ccd_casadi/**/*.py",
@@ -58,14 +58,12 @@ def strings() -> str:
     """Every string of the packages, … for what is put in."""
 
     def each() -> Iterator[str]:
-        for package in ("ccd_casadi", "surrogates"):
-            for file in (ROOT / package).rglob("*.py"):
-                for node in ast.walk(ast.parse(file.read_text())):
-                    if isinstance(node, ast.JoinedStr):
-                        parts = (getattr(part, "value", None) for part in node.values)
-                        yield "".join(part if isinstance(part, str) else "…" for part in parts)
-                    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                        yield node.value
+        for node in chain.from_iterable(map(nodes, SOURCES)):
+            if isinstance(node, ast.JoinedStr):
+                parts = (getattr(part, "value", None) for part in node.values)
+                yield "".join(part if isinstance(part, str) else "…" for part in parts)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
 
     return "\n".join(each())
 

@@ -14,10 +14,11 @@ from oracles import consistency
 from oracles.page_figures import disagreements, page_of, same
 
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.paint import write_page
+from ccd_casadi.drawing import paint
 
 SLOW = pytest.mark.slow
-SEEDS = [2, 4, *(pytest.param(seed, marks=SLOW) for seed in (1, 5, 9, 13))]
+# of mixed sensitivity it is case study 1, below
+SEEDS = [2, *(pytest.param(seed, marks=SLOW) for seed in (1, 4, 5, 9, 13))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -67,14 +68,17 @@ def test_a_figure_that_is_another_on_one_page_is_found(run: Path, key: str, what
     assert any(not words.startswith("terminal") and what in words for words in found)
 
 
-def test_a_proof_that_is_none_and_half_a_point_are_found(run: Path) -> None:
+def test_a_proof_that_is_none_and_half_a_point_are_found(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paint, "draw", lambda *_: None)  # what is read is report.json
     text, page = terminal_of(run), page_of(run)
     claimed = text + "\nproven for the whole box by 10 enclosures"
     assert disagreements(run, claimed) == ["terminal: proven, no proof"]
     head = ("frequency (Hz)", "Re L (–)", "Im L (–)")
     table = c.Table(head, ((1.0, "–", 0.0), (2.0, 1.0, 2.0)))
     half = c.Figure(c.Lines((), ""), "", (table,))
-    write_page(run / "report.html", replace(page, chapters=(c.Chapter("L", (half,)),
+    paint.write_page(run / "report.html", replace(page, chapters=(c.Chapter("L", (half,)),
                                                             *page.chapters)))  # fmt: skip
     assert disagreements(run, text) == ["table: Re L (–) and its Im"]
 

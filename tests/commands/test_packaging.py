@@ -11,12 +11,11 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
+from oracles.sources import ROOT, SOURCES, nodes
 
 import ccd_casadi
 from ccd_casadi.support import options
 
-ROOT = Path(__file__).resolve().parents[2]
-SOURCES = [*(ROOT / "ccd_casadi").rglob("*.py"), *(ROOT / "surrogates").rglob("*.py")]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # what is imported has another name than what is declared, and need not be installed here
 NAMES = {"skfem": "scikit-fem", "sklearn": "scikit-learn"}
@@ -32,7 +31,7 @@ EXTRAS = {name: {*map(normal, all_)} for name, all_ in PROJECT["optional-depende
 
 def imported(path: Path) -> Iterator[str]:
     """Top-level names of what a module imports, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -41,7 +40,7 @@ def imported(path: Path) -> Iterator[str]:
 
 def required(path: Path) -> Iterator[tuple[str, str]]:
     """Package and extra of every `require("package", "extra")`."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "require":
             words = [item.value for item in node.args if isinstance(item, ast.Constant)]
             if len(words) == 2:
@@ -66,7 +65,7 @@ def test_what_examples_and_studies_import_is_there() -> None:
     """They are run by hand: a name that has moved would be found missing late."""
     missing = []
     for path in (*(ROOT / "examples").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             place = (getattr(node, "module", None) or "").split(".")[0]
             if isinstance(node, ast.ImportFrom) and place in ("ccd_casadi", "surrogates"):
                 try:

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from oracles.sources import ROOT, SOURCES, nodes
 
-ROOT = Path(__file__).parents[2]
-SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
 # Pipes between the processes of one run.
 LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"}
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
@@ -34,7 +33,7 @@ BY_NAME = {
 
 def calls(path: Path) -> Iterator[tuple[str, ast.Call]]:
     """Every call in a source file by its dotted name."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Call):
             yield ast.unparse(node.func), node
 

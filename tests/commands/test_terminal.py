@@ -31,7 +31,7 @@ def on_screen(columns: int, *words: str) -> list[str]:
     return [line.split("\r")[-1].replace("\x1b[2K", "") for line in lines]
 
 
-@pytest.mark.parametrize("columns", [60, 80])
+@pytest.mark.parametrize("columns", [60, pytest.param(80, marks=pytest.mark.slow)])
 def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
     """Lines break between words, paths are whole, and no bar stays on a line of the answer."""
     case = str(ccd_casadi.TWO_MASS)

@@ -22,6 +22,7 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
@@ -191,9 +192,21 @@ def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
                 known.validate(other)
 
 
-@pytest.mark.parametrize("name", EACH)
-def test_what_is_infeasible_has_a_result_too(name: str, schema: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("mixed", {}),
+        ("sections", {"structure": Structure(lead=0, biquads=0, roll_off=0)}),  # none is stable
+        # whose nearest controllers climb for ten seconds
+        *(pytest.param(name, {}, marks=pytest.mark.slow) for name in ("sections", *HEAVY)),
+    ],
+)
+def test_what_is_infeasible_has_a_result_too(
+    name: str, changes: dict[str, Any], schema: dict[str, Any]
+) -> None:
     case = lean(KINDS[name])
+    if changes and isinstance(case.controller, StructuredProblem):
+        case = replace(case, controller=replace(case.controller, **changes))
     none = replace(case, inner=replace(case.inner, S_low=1e-6))
     result = solve(none, Direct(starts=1, box_points=2)).result
     assert (result["status"], result["format"]) == ("infeasible", FORMAT)
@@ -214,7 +227,8 @@ def test_a_resumed_run_makes_no_new_synthesis(run: Run) -> None:
     assert sum(run.made[1].values()) <= 1
 
 
-@pytest.mark.parametrize("kind", list(AT_THE_END))
+# of sections, whose searches take three times as long, test_a_resumed_run_is_the_same is kept
+@pytest.mark.parametrize("kind", ["mixed", pytest.param("sections", marks=pytest.mark.slow)])
 def test_an_interrupted_run_makes_no_synthesis_twice(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,8 @@ delay_us = 80.0
 gain = 0.02
 [sampling]
 points = 2
+[outer]
+box_points = 0
 """
 
 
@@ -236,6 +238,7 @@ def test_a_delay_beyond_that_of_the_design_is_the_cause_and_no_rate_is_the_remed
     assert deploy_main([str(run), *kept, *COMMON]) == 0
 
 
+@pytest.mark.slow  # of mixed sensitivity it is in test_deploy_robust
 def test_a_run_that_is_not_verified_deploys_as_such(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -60,6 +60,7 @@ def hostile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     head = f'[plant]\nfunction = "plant.py:f"\nnote = {quoted}\ntable = [{quoted}]\n'
     theta = f"[theta.m]\nlower = 10.0\nupper = 20.0\nunit = {quoted}\n"
     quick = "\n[sampling]\nlifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1\n"
+    quick += "box_points = 0\n"
     case = place / "<b>case.toml"
     rest = text[text.index("[objective]") :].replace("S_max = 1.75", "S_max = 1.9")
     case.write_text(f"# {HOSTILE}\n{head}{theta}{rest}{quick}")

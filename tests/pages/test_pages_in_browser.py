@@ -6,6 +6,7 @@ import shutil
 from io import BytesIO
 
 import pytest
+from oracles.chromium import chromium
 from oracles.kept_pictures import picture
 from PIL import Image
 
@@ -66,6 +67,21 @@ CONTRAST = r"""() => {
     .map(v => Math.max(v, ground) / Math.min(v, ground)))
   return {words: least("svg text", "fill"), curves: least("[id*='-curve'] path", "stroke")}
 }"""
+
+
+@pytest.fixture(scope="module")
+def one_browser():
+    """For all tests here, which need no other event loop: to start one takes a second."""
+    with chromium() as made:
+        yield made
+
+
+@pytest.fixture
+def browser(one_browser):
+    """The same without the pages of the test before."""
+    yield one_browser
+    for context in one_browser.contexts:
+        context.close()
 
 
 def complaints(page):

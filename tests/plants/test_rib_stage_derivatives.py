@@ -27,7 +27,8 @@ def along(stage: RibStage, theta: tuple[float, ...], way: np.ndarray, step: floa
     """d/ds of K, B, Cᵀ at θ (1 + s way), central differences."""
     values = []
     for k in (-2, -1, 1, 2):
-        system = stage.mechanics(np.array(theta) * (1.0 + k * step * way))
+        moved = np.array(theta) * (1.0 + k * step * way)
+        system = stage.mechanics(moved, derivatives=False)
         values.append((system.K, system.B, system.C.T))
     return [
         (f[0] - 8.0 * f[1] + 8.0 * f[2] - f[3]) / (12.0 * step) for f in zip(*values, strict=True)

@@ -163,7 +163,9 @@ def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "formulation", ["nested", pytest.param("lifted", marks=pytest.mark.slow), "direct"]
+    "formulation",
+    # what is resumed ends alike: test_killed_and_resumed_ends_as_if_undisturbed
+    [*(pytest.param(way, marks=pytest.mark.slow) for way in ("nested", "lifted")), "direct"],
 )
 def test_ctrl_c_is_resumable(
     undisturbed: tuple[Callable[..., list[str]], Path], tmp_path: Path, formulation: str

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -60,9 +61,11 @@ def test_a_module_does_not_take_the_place_of_the_function_of_its_name() -> None:
 
 
 def test_the_result_is_told_and_on_disk_before_the_report_is_drawn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     seen = []
+    shutil.copy(two_mass_run / "samples.sqlite", tmp_path)  # nothing is sampled anew
 
     def drawn(folder: Path, *rest: object, **more: object) -> None:
         seen.append(((folder / "result.json").exists(), "status" in capsys.readouterr().out))
