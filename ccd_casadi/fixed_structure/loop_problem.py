@@ -226,7 +226,7 @@ class LoopProblem:
     @cached_property
     def _kinds(self) -> np.ndarray:
         """Kinds of the channels' own gains, as the kernels have them."""
-        kinds = {Place.WHOLE: GainOf.ROW, Place.SENSOR: GainOf.SENSOR, Place.ACTUATOR: GainOf.ACTUATOR}
+        kinds = dict(zip(Place, GainOf, strict=True))
         return np.array([kinds[one.place] for one in self.bounds.channels], np.int64)
 
     def plants_of(self, constraints: "RowPlaces") -> np.ndarray:

@@ -25,13 +25,7 @@ from ccd_casadi.kernels.loop_point import (
     row_of,
 )
 from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import (
-    GainOf,
-    LoopCurve,
-    gains_and_slopes,
-    second_slopes,
-    warped,
-)
+from ccd_casadi.kernels.sections import GainOf, LoopCurve, gains_and_slopes, second_slopes, warped
 
 
 class Answers(NamedTuple):
@@ -222,7 +216,7 @@ def second(curve, number, which, v, loop):
             response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
         σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
-        kind = broken(curve[j], kinds[number[j] - p]) if number[j] >= p else GainOf.ROW
+        kind = broken(curve[j], number[j], p, kinds)
         columns = m if curve[j] == LoopCurve.GS else p
         if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1

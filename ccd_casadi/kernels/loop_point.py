@@ -143,15 +143,19 @@ def row_of(row, M, rows, columns):
 
 
 @compiled
-def broken(curve, kind):
-    """Kind of a gain: where the loop is broken it is of S and T, other curves count rows."""
-    return kind if curve != LoopCurve.KS and curve != LoopCurve.GS else GainOf.ROW
+def broken(curve, number, p, kinds):
+    """`GainOf` a number: one place alone of S and T where it says so, else rows and whole gains."""
+    found = 0
+    if number >= p and curve != LoopCurve.KS and curve != LoopCurve.GS:
+        found = kinds[number - p]
+    return found
 
 
 @compiled
 def own_gain(curve, i, into, out, k, own, kinds, at):
     """Gain of channel i's own; its row is in M's first row, of one place its entry."""
-    (m, c), p, kind = into.shape, out.shape[1], broken(curve, kinds[i])
+    (m, c), p = into.shape, out.shape[1]
+    kind = broken(curve, p + i, p, kinds)
     if kind == GainOf.ACTUATOR:  # (I + KG)⁻¹ = I - K S G, K = V diag(K_i) Uᵀ
         for a in range(m):
             for b in range(m):
@@ -165,7 +169,8 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
         rows, columns = m, m
     else:
         rows, columns = matrix(curve, into, out, k, at)
-    length = row_of(own[int(curve == LoopCurve.KS or kind == GainOf.ACTUATOR), i], at[M], rows, columns)
+    of_force = int(curve == LoopCurve.KS or kind == GainOf.ACTUATOR)
+    length = row_of(own[of_force, i], at[M], rows, columns)
     if kind == GainOf.ROW:
         return length
     entry = 0.0j
@@ -179,14 +184,14 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
 def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
     (m, c), p = into.shape, out.shape[1]
-    kind, place = GainOf.ROW, number
+    kind, place = broken(curve, number, p, kinds), number
     columns = m if curve == LoopCurve.GS else p
     rows = m if curve == LoopCurve.KS else p
     if number < p:
         matrix(curve, into, out, of[K], at)
         singular(at[M], rows, columns, at[V], sigma, True)
     else:
-        place, kind = 0, broken(curve, kinds[number - p])
+        place = 0
         size = own_gain(curve, number - p, into, out, of[K], own, kinds, at)
         if kind == GainOf.ROW:
             singular(at[M], 1, columns, at[V], sigma, True)
