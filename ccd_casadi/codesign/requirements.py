@@ -15,7 +15,7 @@ from typing import Any
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.fixed_structure.bounds import Bounds, key_words
+from ccd_casadi.fixed_structure.bounds import Bounds, kind_and_channel, key_words
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import constraint_sizes
@@ -148,9 +148,12 @@ def _proven(verified: Verified) -> set[str]:
         return set()
     proof = verified.proof
     raw = {"S_MAX": "S_max", "S_LOW": "S_low"}
-    return {
-        raw.get(name, name) for name, level in proof.levels.items() if level <= 1.0 + proof.slack
-    }
+    found = set()
+    for name, level in proof.levels.items():
+        kind, channel = kind_and_channel(name)
+        if level <= 1.0 + proof.slack:
+            found.add(raw.get(kind, kind) + (f" of {channel}" if channel else ""))
+    return found
 
 
 def _worst(verified: Verified, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
