@@ -15,7 +15,7 @@ from typing import Any
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.fixed_structure.bounds import Bounds, kind_and_channel, key_words
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import constraint_sizes

@@ -2,12 +2,16 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import control
 import numpy as np
 import pytest
 
 import ccd_casadi as ccd
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.break_points import SensorFamily
@@ -22,6 +26,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import RowPlaces, evaluate_rows
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.kernels.loop_grid import second
 from ccd_casadi.kernels.sections import LoopCurve
 from ccd_casadi.lti.loop import Loop, Sampling
@@ -245,3 +250,37 @@ def _responses(
                               np.zeros((1, 2))), Sampling(1.0 / period, 1e6 * delay))  # fmt: skip
     z = np.exp(1j * w * period)
     return loop.as_run[0].at(np.array([z]))[0], free, 2.0 / period * (z - 1.0) / (z + 1.0)
+
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "two_encoders"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('bandwidth_of = "table"\n', "", "controller.bandwidth_of"),
+        ('bandwidth_of = "table"', 'bandwidth_of = "tool"', "name one of them"),
+        ("outputs = [1, 0]", "outputs = [1, 0]\nintegrator = true", "two integrators"),
+        ("outputs = [1, 0]", "outputs = [1, 0]\ninputs = [1]", "all channels drive one actuator"),
+        ("S_max = 2.0\n", 'S_max = 2.0\nminimise = "rms_error"\n', "inner.minimise"),
+    ],
+)  # fmt: skip
+def test_what_several_sensors_cannot_have_is_named(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    (tmp_path / "plant.py").write_text((EXAMPLE / "plant.py").read_text())
+    text = (EXAMPLE / "case.toml").read_text()
+    assert old in text
+    (tmp_path / "case.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(CaseError, match=words):
+        problem_of(load_case(tmp_path / "case.toml"))
+
+
+def test_channels_need_no_tables_and_the_counting_one_alone_integrates(tmp_path: Path) -> None:
+    (tmp_path / "plant.py").write_text((EXAMPLE / "plant.py").read_text())
+    text = (EXAMPLE / "case.toml").read_text().replace('"table"', '"2"')
+    head, _, rest = text.partition("[controller.channel.motor]")
+    (tmp_path / "case.toml").write_text(head + rest[rest.index("[inner]") :])
+    found = structure_of(problem_of(load_case(tmp_path / "case.toml")))
+    assert isinstance(found, ChannelStructure)
+    assert [own.integrator for own in found.structures] == [False, True]
