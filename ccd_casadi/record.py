@@ -5,8 +5,6 @@ import sys
 from dataclasses import replace
 from io import BytesIO, StringIO
 
-import numpy as np
-
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import option, positive, real, valued
@@ -34,6 +32,8 @@ from ccd_casadi.support.terminal import inform
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Estimate, print a table, write response.npz, response.csv and response.png."""
+    import numpy as np
+
     from ccd_casadi.records.findings import findings
     from ccd_casadi.records.plant_estimate import EstimateOptions, estimate_plant
     from ccd_casadi.records.time_series import SignalNames, read_record

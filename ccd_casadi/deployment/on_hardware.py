@@ -79,7 +79,7 @@ class Electronics:
         UserError
             Of the option, with the largest value that it may have.
         """
-        if self.jitter > period:
+        if self.jitter > period * (1.0 + 1e-9):  # as far as a period that is written is it
             words = f"--jitter {self.jitter:g}: is more than a period of the loop"
             most = f"{inwards(period, 4, 15):g} s ({1.0 / period:.6g} Hz)"
             raise UserError(

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import schur, solve_sylvester
+from scipy.linalg.lapack import dtrsen
 
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular
@@ -34,10 +35,14 @@ def unstable_part(A, C):
 
     P is singular where C does not see one of the modes.
     """
-    T, V, k = schur(A, sort="rhp")
-    V = V[:, :k]
+    T, V = schur(A)
+    grow = np.diag(T) > 0.0  # of a pair both: LAPACK's blocks have equal diagonals
+    k = int(grow.sum())
     if not k:
-        return V, np.zeros((0, 0))
+        return V[:, :0], np.zeros((0, 0))
+    # Not by `schur(sort=...)`: its call-back into Python writes on stderr where Ctrl-C meets it.
+    T, V = dtrsen(grow, T, V, job=b"N")[:2]
+    V = V[:, :k]
     return V, lyapunov_triangular(np.ascontiguousarray(T[:k, :k]), (C @ V).T @ (C @ V), True)
 
 
