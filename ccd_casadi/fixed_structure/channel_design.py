@@ -193,27 +193,23 @@ def _of_sensors(
     search: DesignSearch, problem: CompositeProblem, alike: Sequence[ScaledPlant]
 ) -> list[Array]:
     """Controllers κ in SI of one sensor alone, the others' gains as small as they may be."""
-    bounds = replace(problem.bounds, channels=(), error=None)
-    least, found = np.exp(problem.box[0]), list[Array]()
-    smallest = problem.structure.in_units(
-        np.log(np.maximum(least, 1e-300)), problem.plants.omega_0, problem.plants.force
-    )
-    middle = problem.structure.in_units(
-        problem.box.mean(axis=0), problem.plants.omega_0, problem.plants.force
-    )
-    gains = np.array([kind is ParameterKind.GAIN for kind in problem.structure.kinds])
-    for i, own in enumerate(problem.structure.structures):
-        plants = [channel_plant(plant, problem.structure.decoupling, i) for plant in alike]
+    bounds, structure = replace(problem.bounds, channels=(), error=None), problem.structure
+    gains = np.array([kind is ParameterKind.GAIN for kind in structure.kinds])
+    least = np.where(gains, problem.box[0], problem.box.mean(axis=0))
+    idle = structure.in_units(least, problem.plants.omega_0, problem.plants.force)
+    found = list[Array]()
+    for i, own in enumerate(structure.structures):
+        plants = [channel_plant(plant, structure.decoupling, i) for plant in alike]
         alone = problem_for(plants, own, bounds, search.sampling, span_of(problem),
                             margin=problem.margin)  # fmt: skip
-        name = problem.structure.decoupling.names[i]
+        name = structure.decoupling.names[i]
         made = of_one_channel(replace(
             search, problem=alone, plants=plants, initial=[], began=perf_counter(),
             tell=titled(search.tell, f"sensor {name} alone"),
         ))  # fmt: skip
         if np.isfinite(made.kappa).all():
-            kappa = np.where(gains, smallest, middle)
-            kappa[problem.structure.slices[i]] = made.kappa
+            kappa = idle.copy()
+            kappa[structure.slices[i]] = made.kappa
             found.append(kappa)
     return found
 
