@@ -124,7 +124,7 @@ def summed(errors: list[Errors]) -> Errors:
     )
 
 
-@pytest.mark.parametrize("count", [5, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])
 def test_total_derivatives_of_the_two_mass_plant(count: int) -> None:
     rng = np.random.default_rng(5)
     errors = []
