@@ -39,7 +39,7 @@ from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent, titled
 from ccd_casadi.support.worker_process import one_blas_thread
@@ -200,8 +200,11 @@ def _of_sensors(
     found = list[Array]()
     for i, own in enumerate(structure.structures):
         plants = [channel_plant(plant, structure.decoupling, i) for plant in alike]
-        alone = problem_for(plants, own, bounds, search.sampling, span_of(problem),
-                            margin=problem.margin)  # fmt: skip
+        try:
+            alone = problem_for(plants, own, bounds, search.sampling, span_of(problem),
+                                margin=problem.margin)  # fmt: skip
+        except PlantError:  # as of a difference of sensors, which sees no free body
+            continue
         name = structure.decoupling.names[i]
         made = of_one_channel(replace(
             search, problem=alone, plants=plants, initial=[], began=perf_counter(),

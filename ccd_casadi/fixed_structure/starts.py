@@ -12,17 +12,19 @@ plant is on its stiffness line at the crossover (a piezo) its lead is turned aro
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, channel_plant
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops, plant_set
+from ccd_casadi.fixed_structure.plant_set import PlantSet, all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
 
 # Two biquads at a resonance: (root, over its frequency, damping), first a lag, then a lead.
 SKEWED = (
@@ -159,6 +161,18 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     return np.clip(kappa, *problem.box)
 
 
+def _seen_by(
+    structure: ChannelStructure, plant: ScaledPlant, number: int, sampling: Sampling | None
+) -> PlantSet:
+    """The plant of a channel, or of the first that can hold all motions where this one cannot, as
+    the difference of two sensors cannot hold a free body."""
+    order = [number, *(i for i in range(len(structure.structures)) if i != number)]
+    for i in order[:-1]:
+        with suppress(PlantError):
+            return plant_set([channel_plant(plant, structure.decoupling, i)], sampling)
+    return plant_set([channel_plant(plant, structure.decoupling, order[-1])], sampling)
+
+
 def actuator_starts(
     problem: LoopProblem,
     structure: ChannelStructure,
@@ -179,7 +193,7 @@ def actuator_starts(
     draws, (low, high) = draws_for_each * count, crossovers_of
     parts = []
     for i, own in enumerate(structure.structures):
-        family = plant_set([channel_plant(plants[0], structure.decoupling, i)], sampling)
+        family = _seen_by(structure, plants[0], i, sampling)
         single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
         crossovers = np.exp(rng.uniform(np.log(low), np.log(high), draws))
         kappa = at_random(single, crossovers, rng)

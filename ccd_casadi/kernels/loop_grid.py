@@ -21,6 +21,7 @@ from ccd_casadi.kernels.loop_point import (
     broken,
     closed,
     gain_of,
+    over_one_plus_L,
     room,
     row_of,
 )
@@ -220,7 +221,7 @@ def second(curve, number, which, v, loop):
         columns = m if curve[j] == LoopCurve.GS else p
         if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1
-        _by_channel(curve[j], number[j], kind, place, into, p, own, at, of, crossed, moved, back,
+        _by_channel(curve[j], number[j], kind, place, into, out, own, at, of, crossed, moved, back,
                     ahead)  # fmt: skip
         second_slopes(factors, g, bend)
         for a in range(n):
@@ -252,11 +253,13 @@ def _over_gap(σ, other):
 
 
 @inlined
-def _by_channel(curve, number, kind, place, into, p, own, at, of, crossed, moved, back, ahead):
+def _by_channel(curve, number, kind, place, into, out, own, at, of, crossed, moved, back, ahead):
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
-    (m, c), at_actuator = into.shape, kind == GainOf.ACTUATOR
+    (m, c), p, at_actuator = into.shape, out.shape[1], kind == GainOf.ACTUATOR
+    shared = m == 1 and p > 1
+    one = over_one_plus_L(out, of[K], at) if shared else 1.0 + 0.0j
     of_force = curve == LoopCurve.KS or at_actuator
     rows, columns = m if of_force else p, m if curve == LoopCurve.GS else p
     columns = 1 if kind != GainOf.ROW else columns
@@ -266,7 +269,8 @@ def _by_channel(curve, number, kind, place, into, p, own, at, of, crossed, moved
     for i in range(c):
         for h in range(c):
             for a in range(p):
-                R[i, h] += at[US, i, a] * at[GV, a, h]
+                left = out[i, a] * one if shared else at[US, i, a]
+                R[i, h] += left * at[GV, a, h]
             crossed[i, h] = of[LEFT, i] * of[K, i] * R[i, h] * of[K, h] * of[RIGHT, h]
     sign = 1.0 if curve == LoopCurve.T else -1.0
     for i in range(c):
@@ -278,8 +282,11 @@ def _by_channel(curve, number, kind, place, into, p, own, at, of, crossed, moved
                 if at_actuator:
                     P[a, i] = -P[a, i]
             else:
-                for b in range(p):
-                    P[a, i] += sign * at[S, a, b] * at[GV, b, i]
+                if shared:
+                    P[a, i] = sign * at[GV, a, i] * one
+                else:
+                    for b in range(p):
+                        P[a, i] += sign * at[S, a, b] * at[GV, b, i]
         for q in range(columns):
             for b in range(p):
                 entry = at[V, b, q]

@@ -67,6 +67,17 @@ def room(loop):
 
 
 @compiled
+def over_one_plus_L(out, k, at):
+    """1/(1 + L), L = Σ K_i U_iᵀ G V_i, of one actuator; S G V = G V/(1 + L) there."""
+    c, p = out.shape
+    total = 1.0 + 0.0j
+    for i in range(c):
+        for a in range(p):
+            total += k[i] * out[i, a] * at[GV, a, i]
+    return inverse(total)
+
+
+@compiled
 def closed(into, out, k, at):
     """Fills G V, G K, S and Uᵀ S from G and K_i (c,)."""
     (m, c), p = into.shape, out.shape[1]
@@ -83,6 +94,16 @@ def closed(into, out, k, at):
             at[GK, a, b] = total
     if p == 1:
         at[S, 0, 0] = inverse(1.0 + at[GK, 0, 0])
+    elif m == 1:  # GK = g kᵀ: I + GK is all but singular where |L| is large
+        one = over_one_plus_L(out, k, at)
+        for a in range(p):
+            for b in range(p):
+                at[S, a, b] = -at[GK, a, b] * one
+            others = 1.0 + 0.0j  # 1 + L without what a has of it, the trace of GK being L
+            for b in range(p):
+                if b != a:
+                    others += at[GK, b, b]
+            at[S, a, a] = others * one
     else:
         inverted = np.empty((p, p), np.complex128)
         for a in range(p):
@@ -166,6 +187,8 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
                         inner += at[US, h, d] * at[G, d, b]
                     total -= into[a, h] * k[h] * inner
                 at[M, a, b] = total
+        if m == 1 and p > 1:
+            at[M, 0, 0] = over_one_plus_L(out, k, at)
         rows, columns = m, m
     else:
         rows, columns = matrix(curve, into, out, k, at)
@@ -201,6 +224,8 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
             for b in range(columns):
                 at[V, b, 0] = own[2, number - p, b]
     at_actuator = kind == GainOf.ACTUATOR
+    shared = m == 1 and p > 1
+    one = over_one_plus_L(out, of[K], at) if shared else 1.0 + 0.0j
     scale = 1.0 / (sigma[place] * sigma[place])
     for a in range(rows):
         if number < p:
@@ -222,7 +247,8 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
     for i in range(c):
         total = 0.0j
         for b in range(p):
-            total += at[US, i, b] * of[W, b]
+            left = out[i, b] * one if shared and at_actuator else at[US, i, b]
+            total += left * of[W, b]
         of[RIGHT, i], total = total, 0.0j
         if curve == LoopCurve.KS or at_actuator:
             for a in range(m):
@@ -240,8 +266,14 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
         of[X, b] = total
     for i in range(c):
         total = of[LEFT, i]
-        for a in range(p):
-            total += of[X, a] * at[GV, a, i]
+        if shared:
+            total *= one
+            if curve != LoopCurve.KS and not at_actuator:
+                for a in range(p):
+                    total += sign * of[U, a] * at[GV, a, i] * one
+        else:
+            for a in range(p):
+                total += of[X, a] * at[GV, a, i]
         if at_actuator:  # d(I + KG)⁻¹ = -(I + KG)⁻¹ dK S G, of KS it is (I + KG)⁻¹ dK S
             total = -total
         of[LEFT, i], of[SHARE, i] = total, total * of[K, i] * of[RIGHT, i]
@@ -249,7 +281,11 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
         total = 0.0j
         for i in range(c):
             total += into[a, i] * of[K, i] * of[RIGHT, i]
-        of[Y, a] = at[V, a, 0] - total if at_actuator else total
+        if shared and at_actuator:
+            total = at[V, a, 0] * one
+        elif at_actuator:
+            total = at[V, a, 0] - total
+        of[Y, a] = total
     return sigma[place], place
 
 

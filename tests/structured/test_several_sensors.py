@@ -284,3 +284,21 @@ def test_channels_need_no_tables_and_the_counting_one_alone_integrates(tmp_path:
     found = structure_of(problem_of(load_case(tmp_path / "case.toml")))
     assert isinstance(found, ChannelStructure)
     assert [own.integrator for own in found.structures] == [False, True]
+
+
+def test_a_difference_of_sensors_that_sees_no_free_body_is_a_channel() -> None:
+    """Alone it cannot be designed; beside the mean of both it may."""
+    mean = given_decoupling(("mean", "difference"), [[1, 1], [1, -1]], [[1], [1]])
+    structure = ChannelStructure(mean, (
+        Structure(lead=1, biquads=0, roll_off=1),
+        Structure(integrator=False, lead=1, biquads=0, roll_off=1),
+    ))  # fmt: skip
+    plant = two_masses()
+    A = plant.A.copy()
+    A[2, 2] += 0.7 / 0.0329  # without the brake, so that the body is free
+    made = ccd.synthesise_sections(
+        control.ss(A, plant.B, plant.C, plant.D), structure,
+        bounds(error=0, channels=sensors_on_one_actuator(mean, 2.0)), sampling=RATE,
+        M_K=0.11 * (30.0 * HZ) ** 2, starts=3,
+    )  # fmt: skip
+    assert made.certified, made.words
