@@ -43,8 +43,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.kinds import FixedStructure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.loop import tustin
+    from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import loop_lines
-    from ccd_casadi.reporting.run_verdict import advice
     from ccd_casadi.reporting.structured_page import measured_page
     from ccd_casadi.studies.measured_answer import answer_of
     from ccd_casadi.studies.present_controller import present_loop
