@@ -5,7 +5,7 @@ from pathlib import Path
 
 # What worker processes need, most of a second to import.
 SEARCH = "ccd_casadi.inner_problem.structured_search", "ccd_casadi.kernels.loaded"
-SAMPLING = *SEARCH, "ccd_casadi.sampling.units", "scipy.optimize"
+SAMPLING = *SEARCH, "ccd_casadi.sampling.unit_kinds", "scipy.optimize"
 DRAWING = "ccd_casadi.drawing.paint", "matplotlib.backends.backend_svg"
 
 

@@ -46,7 +46,7 @@ from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.units import NeighbourOptions
+from ccd_casadi.sampling.structured_units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.process_pool import Workers, results

@@ -37,7 +37,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_structured,
 )
 from ccd_casadi.limitations.of_problem import Gap
-from ccd_casadi.sampling.units import from_controller
+from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import HZ, counted, told_apart

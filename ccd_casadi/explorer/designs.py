@@ -39,7 +39,7 @@ from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.sample_keys import hashes_of, sample_key
 from ccd_casadi.sampling.store import Sample
-from ccd_casadi.sampling.units import structured_unit
+from ccd_casadi.sampling.unit_kinds import units_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ
@@ -369,7 +369,7 @@ def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
     own = sample_key(inner, knobs.theta)
-    rows, payload = structured_unit(problem, designs, own, knobs.theta)
+    rows, payload = units_of(problem).solve(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None
     return Designed(
         problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, knobs.theta, payload)

@@ -26,14 +26,8 @@ from ccd_casadi.sampling.inner_samples import (
 )
 from ccd_casadi.sampling.sample_keys import best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.store import Sample, SampleStore
-from ccd_casadi.sampling.units import (
-    design_unit,
-    from_controller,
-    from_neighbour,
-    inner_unit,
-    promising_starts,
-    timed,
-)
+from ccd_casadi.sampling.unit_kinds import inner_unit, units_of
+from ccd_casadi.sampling.units import design_unit, timed
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress, remark
@@ -145,20 +139,22 @@ class Sampler:
     def values(self, thetas: Array, label: str = "sampling") -> list[InnerSample]:
         """ω_b* at every row of `thetas`, in their order: the best that is known there.
 
-        Of fixed structures a new θ begins from what is known near by too, and what falls short of
-        its neighbours is climbed anew (`neighbours`). Where the time is up those that are left are
+        A kind may begin a new θ from what is known near by, and search samples again that fall
+        short of their neighbours (`InnerUnits`). Where the time is up those that are left are
         `unsearched`.
         """
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
         known = list(self.solved.values())
         new = [theta for theta in points if theta not in self.solved]
-        self._learn({theta: from_neighbour(self.problem, known, theta) for theta in new}, label)
+        begin = units_of(self.problem).begin
+        self._learn({theta: begin(self.problem, known, theta) for theta in new}, label)
         return [self.solved.get(theta) or unsearched(theta) for theta in points]
 
     def value_from(self, theta: Sequence[float], kappa: Sequence[float]) -> InnerSample:
         """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
         point = tuple(float(v) for v in theta)
-        self._learn({point: from_controller(self.problem, kappa)}, "from a controller")
+        start = units_of(self.problem).begin_at(self.problem, kappa)
+        self._learn({point: start}, "from a controller")
         return self.solved.get(point) or unsearched(point)
 
     def latest(self, samples: Sequence[InnerSample]) -> list[InnerSample]:
@@ -170,17 +166,15 @@ class Sampler:
         of them, until none does."""
         reported = len(self.trace)
         self._solve(problems, label)
-        while tasks := promising_starts(self.problem, self.solved.values(), self._tried):
+        units = units_of(self.problem)
+        while again := units.retries(self.problem, self.solved.values(), self._tried):
             if time_is_up():
                 break
-            before = {theta: self.solved[theta] for theta in tasks}
-            problems = {
-                theta: from_controller(self.problem, kappa) for theta, kappa in tasks.items()
-            }
-            self._solve(problems, "from neighbours")
-            for theta, kappa in tasks.items():
-                if self.solved[theta] is before[theta]:
-                    self._tried.setdefault(theta, []).append(kappa)
+            before = {retry.theta: self.solved[retry.theta] for retry in again}
+            self._solve({retry.theta: retry.problem for retry in again}, "from neighbours")
+            for retry in again:
+                if self.solved[retry.theta] is before[retry.theta]:
+                    self._tried.setdefault(retry.theta, []).append(retry.kappa)
         self.report(reported)
 
     def _solve(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:

@@ -1,21 +1,20 @@
-"""Units of work: the inner problem at one θ, as a worker process computes it, and where neighbours
-let it begin."""
+"""Units of work: the inner problem at one θ, as a worker process computes it.
 
+`InnerUnits` is all that the sampler knows of a kind of inner problem: how a sample is computed,
+where its search begins beside known samples, and which samples are searched again. The table of
+kinds stands in `unit_kinds`.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import TypeVar
 
 import numpy as np
 
-from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
-from ccd_casadi.inner_problem.objective import objective, objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, true_design, true_inner
-from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_search import with_warm_start
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
 from ccd_casadi.sampling.inner_samples import InnerSample, sample_of
 from ccd_casadi.sampling.sample_keys import sample_key
@@ -23,134 +22,73 @@ from ccd_casadi.sampling.store import Sample
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.time_budget import time_is_up
 
-
-@dataclass(frozen=True)
-class NeighbourOptions:
-    """Numbers of warm starts from neighbours.
-
-    Attributes
-    ----------
-    least_gain : float
-        Relative: what another branch has to promise, and what a verdict counts as better.
-    more : int
-        Neighbours besides one for each parameter.
-    near : float
-        Of the box: so near the best θ a surrogate has to be of one branch.
-    tries : int
-        Searches of a sample from neighbours that may be in vain.
-    """
-
-    least_gain: float = 1e-3
-    more: int = 2
-    near: float = 0.1
-    tries: int = 2
-
-
 Theta = tuple[float, ...]
 R = TypeVar("R")
 Task = TypeVar("Task")
 
 
-def from_neighbour(
-    problem: CoDesignProblem,
-    known: Iterable[InnerSample],
-    theta: Theta,
-    options: NeighbourOptions = NeighbourOptions(),
-) -> CoDesignProblem:
-    """The problem with the neighbour's controller that promises most at a new θ as a warm start."""
-    near = _nearest(problem, _usable(known), theta, options.more)
-    if not near:
-        return problem
-
-    def promise(one: InnerSample) -> float:
-        return problem.figure.gain(_branch(one, theta, one.gradient), near[0].value)
-
-    return with_warm_start(problem, max(near, key=promise).kappa)
-
-
-def from_controller(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
-    """The problem whose value is that of the search from one controller alone.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-        With controllers of fixed structure.
-    kappa : sequence of float
-        κ of the controller, SI.
-
-    Returns
-    -------
-    CoDesignProblem
-        With it as the only warm start.
-    """
-    structured = structured_of(problem).with_warm_start(tuple(map(float, kappa)), 1)
-    return replace(problem, controller=replace(structured, starts=0))
-
-
-def promising_starts(
-    problem: CoDesignProblem,
-    known: Iterable[InnerSample],
-    tried: Mapping[Theta, Sequence[Theta]],
-    options: NeighbourOptions = NeighbourOptions(),
-) -> dict[Theta, Theta]:
-    """κ to start from at each θ whose sample falls short of what a neighbour promises.
-
-    Only where that counts: near the best θ, or where it would be a better one. `tried`: the κ that
-    were in vain at a θ.
-    """
-    samples = _usable(known)
-    found: dict[Theta, tuple[float, Theta]] = {}
-    best = min(samples, key=lambda one: objective_of(problem, one), default=None)
-    for there in samples:
-        assert best is not None
-        theta, before = there.theta, tried.get(there.theta, ())
-        near = _nearest(problem, samples, theta, options.more)
-        for one in near if len(before) < options.tries else []:
-            value = _branch(one, theta, there.gradient)
-            counts = bool(box(problem).away(best.theta, theta) <= options.near)
-            counts = counts or objective(problem, theta, value) < objective_of(problem, best)
-            gain = problem.figure.gain(value, there.value) if value > 0.0 else 0.0
-            least = found.get(theta, (options.least_gain, ()))[0]
-            if counts and one.kappa not in before and gain > least:
-                found[theta] = (gain, one.kappa)
-    return {theta: kappa for theta, (_, kappa) in found.items()}
-
-
-def _usable(known: Iterable[InnerSample]) -> list[InnerSample]:
-    """Those with a controller of fixed structure, and slopes."""
-    return [one for one in known if one.kappa and np.isfinite(one.gradient).all()]
-
-
-def _branch(one: InnerSample, theta: Theta, gradient: Theta) -> float:
-    """The value that a sample's branch has at another θ, where its gradient is this one."""
-    slope = 0.5 * np.add(one.gradient, gradient)
-    return one.value + float(np.subtract(theta, one.theta) @ slope)
-
-
-def _nearest(
-    problem: CoDesignProblem, samples: Sequence[InnerSample], theta: Theta, more: int
-) -> list[InnerSample]:
-    """The nearest samples at other θ."""
-    others = [one for one in samples if one.theta != theta]
-    if not others:
-        return []
-    away = box(problem).away([one.theta for one in others], theta)
-    return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + more]]
-
-
-NOTHING = (np.nan, np.nan)
 Unit = tuple[list[Sample], dict]  # rows of the store, and payload of the inner problem
 
 
-def inner_unit(
-    task: tuple[CoDesignProblem, str, str, tuple[float, ...]], workers: Pool | None = None
-) -> tuple[str, Unit]:
-    """Solve the inner problem at one θ; every synthesis becomes a row. First the unit's key.
+@dataclass(frozen=True)
+class Retry:
+    """A sample to search again: its θ, and the problem with the start that promises more.
 
-    `workers`: those that have nothing else to do.
+    Attributes
+    ----------
+    theta, kappa : tuple of float
+        θ, and the controller of a neighbour from which the search starts; both SI.
+    problem : CoDesignProblem
     """
-    problem, problem_key, key, theta = task
-    return key, UNITS[type(problem.controller)](problem, problem_key, key, theta, workers)
+
+    theta: Theta
+    kappa: Theta
+    problem: CoDesignProblem
+
+
+class InnerUnits(ABC):
+    """The samples of one kind of inner problem; by default each stands alone."""
+
+    @abstractmethod
+    def solve(
+        self, problem: CoDesignProblem, problem_key: str, key: str, theta: Theta,
+        workers: Pool | None = None,
+    ) -> Unit:  # fmt: skip
+        """Solve the inner problem at one θ.
+
+        Parameters
+        ----------
+        problem, problem_key, key : CoDesignProblem, str, str
+            The problem, its hash, and the key of the unit.
+        theta : tuple of float
+            SI.
+        workers : Pool
+            Processes that have nothing else to do.
+
+        Returns
+        -------
+        rows, payload : list of Sample, dict
+            A row for each design, and JSON values of the best.
+        """
+
+    def begin(
+        self, problem: CoDesignProblem, known: Iterable[InnerSample], theta: Theta
+    ) -> CoDesignProblem:
+        """The problem with what known samples give a search at a new θ to start from."""
+        return problem
+
+    def begin_at(self, problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
+        """The problem whose search starts from one controller (κ in SI) alone, where it has one."""
+        return problem
+
+    def retries(
+        self,
+        problem: CoDesignProblem,
+        known: Iterable[InnerSample],
+        tried: Mapping[Theta, Sequence[Theta]],
+    ) -> list[Retry]:
+        """Samples to search again; `tried`: the κ that were in vain at a θ."""
+        return []
 
 
 def timed(
@@ -163,15 +101,17 @@ def timed(
     return unit(task), not time_is_up()
 
 
-def mixed_unit(
-    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
-    workers: Pool | None = None,
-) -> Unit:  # fmt: skip
-    """The search of (ω_S, ω_T) at one θ."""
-    began = perf_counter()
-    result = true_inner(problem, theta)
-    each = (perf_counter() - began) / max(result.syntheses, 1)
-    return unit_of(problem_key, theta, result, problem.inner, each)
+class MixedUnits(InnerUnits):
+    """Of mixed sensitivity: every synthesis of a search of (ω_S, ω_T) is a row."""
+
+    def solve(
+        self, problem: CoDesignProblem, problem_key: str, key: str, theta: Theta,
+        workers: Pool | None = None,
+    ) -> Unit:  # fmt: skip
+        began = perf_counter()
+        result = true_inner(problem, theta)
+        each = (perf_counter() - began) / max(result.syntheses, 1)
+        return unit_of(problem_key, theta, result, problem.inner, each)
 
 
 def unit_of(
@@ -205,75 +145,15 @@ def unit_of(
     if (optimum := result.optimum) is not None:
         found = {name: getattr(optimum.figures, name, None) for name in found}
         gradient = bandwidth_gradient(optimum, result.active, tuple(inner.bounds))
-        found["gradient"] = [_number(v) for v in gradient]
+        found["gradient"] = [json_number(v) for v in gradient]
     payload = {
         **found,
         "active": list(result.active),
         "shortfall": result.shortfall,
-        "violation": _number(result.violation),
+        "violation": json_number(result.violation),
         "syntheses": len(rows),
     }
     return list(rows.values()), payload
-
-
-def structured_unit(
-    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
-    workers: Pool | None = None,
-) -> Unit:  # fmt: skip
-    """The best design of a fixed structure at one θ: one row, without weights' frequencies.
-
-    Parameters
-    ----------
-    problem, problem_key, key : CoDesignProblem, str, str
-        The problem, its hash, and the key of the row.
-    theta : tuple of float
-        SI.
-    workers : Pool
-        Processes that have nothing else to do.
-
-    Returns
-    -------
-    rows, payload : list of Sample, dict
-        As of `unit_of`.
-    """
-    value = structured_value(problem, theta, workers)
-    design, judged = value.design, value.design.certificate
-    peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
-    highest = max(((plant.S_peak, plant.S_peak_frequency) for plant in peaks), default=NOTHING)
-    row = Sample(
-        key=key,
-        theta=theta,
-        omega_S=0.0,
-        omega_T=0.0,
-        outcome=design.outcome.name.lower(),
-        reason=design.words,
-        bandwidth=value.bandwidth,
-        sensitivity_peak=highest[0],
-        sensitivity_peak_frequency=highest[1],
-        sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
-        norm=max({} if judged is None else judged.worst.values(), default=np.nan),
-        norm_bound=1.0,
-        certified=value.feasible,
-        seconds=design.seconds,
-    )
-    payload = {
-        "bandwidth": _number(value.bandwidth),
-        "gradient": [_number(v) for v in value.gradient] if value.feasible else None,
-        "kappa": [float(v) for v in design.kappa] if value.feasible else [],
-        "error": _number(value.error),
-        "active": sorted(name for name, mu in design.multipliers.items() if mu > 0.0),
-        "shortfall": "" if value.feasible else design.words,
-        "violation": _number(np.log(max(design.short.values()))) if design.short else None,
-        "syntheses": value.syntheses,
-    }
-    return [row], payload
-
-
-# One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
-UNITS: dict[type[ControllerProblem], Callable[..., Unit]] = {
-    MixedSensitivityProblem: mixed_unit,
-    StructuredProblem: structured_unit,
-}
 
 
 def design_unit(
@@ -289,5 +169,6 @@ def design_unit(
     return samples, None
 
 
-def _number(value: float) -> float | None:
+def json_number(value: float) -> float | None:
+    """A number as the store keeps it: None where it is not finite."""
     return float(value) if np.isfinite(value) else None

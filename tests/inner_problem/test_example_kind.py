@@ -30,7 +30,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.sampling.units import UNITS, Unit
+from ccd_casadi.sampling.unit_kinds import UNITS
+from ccd_casadi.sampling.units import InnerUnits, Unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -91,18 +92,22 @@ class ByRule(InnerKind):
         raise AssertionError("no page is drawn here")
 
 
-def rule_unit(
-    case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...], workers: object
-) -> Unit:
-    """One θ for the store."""
-    value, slope = KINDS[RuleOfThumb](case).value(theta)
-    feasible = bool(np.isfinite(value))
-    payload = {
-        "bandwidth": value if feasible else None, "gradient": slope.tolist() if feasible else None,
-        "kappa": [], "active": [], "shortfall": "" if feasible else "a bound is not kept",
-        "violation": None, "syntheses": 1,
-    }  # fmt: skip
-    return [], payload
+class RuleUnits(InnerUnits):
+    """Its samples for the store."""
+
+    def solve(
+        self, problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
+        workers: object = None,
+    ) -> Unit:  # fmt: skip
+        value, slope = KINDS[RuleOfThumb](problem).value(theta)
+        feasible = bool(np.isfinite(value))
+        payload = {
+            "bandwidth": value if feasible else None,
+            "gradient": slope.tolist() if feasible else None,
+            "kappa": [], "active": [], "shortfall": "" if feasible else "a bound is not kept",
+            "violation": None, "syntheses": 1,
+        }  # fmt: skip
+        return [], payload
 
 
 # 3. The design that a run ends with.
@@ -159,7 +164,7 @@ class RuleOuter(ThetaOuter):
 @pytest.fixture
 def case() -> Iterator[CoDesignProblem]:
     """The two masses with this kind, which only these tests know."""
-    tables: list[tuple[dict, Any]] = [(KINDS, ByRule), (UNITS, rule_unit), (OUTERS, RuleOuter)]
+    tables: list[tuple[dict, Any]] = [(KINDS, ByRule), (UNITS, RuleUnits()), (OUTERS, RuleOuter)]
     for table, entry in tables:
         table[RuleOfThumb] = entry
     yield problem(controller=RuleOfThumb(), inner=replace(INNER, S_max=2.5, S_low=0.3), w1=0.05)

@@ -14,7 +14,7 @@ from oracles.helpers import HZ, INNER, problem
 
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.sampling import sampler as module
-from ccd_casadi.sampling import units
+from ccd_casadi.sampling import unit_kinds, units
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -227,7 +227,7 @@ def test_an_easier_problems_designs_are_counted_and_not_traced(tmp_path: Path) -
 
 def test_the_rows_of_a_unit_share_its_seconds() -> None:
     began = time.perf_counter()
-    key, (rows, payload) = units.inner_unit((problem(), "p", "k", (60.0, 60.0)))
+    key, (rows, payload) = unit_kinds.inner_unit((problem(), "p", "k", (60.0, 60.0)))
     elapsed = time.perf_counter() - began
     assert (key, payload["syntheses"]) == ("k", len(rows))
     assert len(rows) > 5
