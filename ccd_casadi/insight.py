@@ -39,7 +39,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         front = pareto_front(
             outer_of, sampler, done.theta, points=options.points, seed=options.seed
         )
-        responses = outer.responses(outer.point_of(done))
+        responses = outer.responses(outer.point_of(done.theta, done.weights))
     seconds = options.seconds()
     told = insight_dict(done, front, responses)
     write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})

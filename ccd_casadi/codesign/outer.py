@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
@@ -41,6 +40,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import counted
 from ccd_casadi.support.time_budget import ends_early, time_is_up
+from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
 
 
@@ -84,11 +84,8 @@ class PolishedDesign:
 
 
 def is_expensive(problem: CoDesignProblem) -> bool:
-    """Whether the plant at another θ takes as long as a search for its controller: finite elements.
-
-    Such a plant has cheap models `nearby` θ that are solved already.
-    """
-    return plant_of(problem).nearby is not None
+    """Whether the plant at another θ takes as long as a search for its controller."""
+    return plant_of(problem).expensive
 
 
 class Outer(ABC):
@@ -231,9 +228,9 @@ class Outer(ABC):
     def verified(self, end: PolishedDesign, rounds: int) -> Verified:
         """Judge the design on the truth, after this number of `rounds` of the whole search."""
 
-    def point_of(self, run: FinishedRun) -> Array:
-        """x of a run's design."""
-        return np.array(run.theta)
+    def point_of(self, theta: Sequence[float], weights: Weights) -> Array:
+        """x of a design at θ (SI) with these weights."""
+        return np.array(theta)
 
     @abstractmethod
     def responses(self, x: Array) -> PostOptimal:

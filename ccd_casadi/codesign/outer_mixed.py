@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.final_judgement import (
     check_references,
@@ -33,6 +32,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
+from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
 
 
@@ -147,8 +147,8 @@ class MixedOuter(Outer):
             second=second_on_weighted(problem, theta, final),
         )
 
-    def point_of(self, run: FinishedRun) -> Array:
-        return np.append(run.theta, np.log([run.weights.omega_S, run.weights.omega_T]))
+    def point_of(self, theta: Sequence[float], weights: Weights) -> Array:
+        return np.append(theta, np.log([weights.omega_S, weights.omega_T]))
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)

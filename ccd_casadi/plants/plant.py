@@ -133,6 +133,9 @@ class Plant:
         Bounds of θ beyond which the plant is not known.
     unknown_between : str
         Why the plant is known at samples of θ alone, where that is so.
+    expensive : bool
+        Whether the plant at another θ takes as long as a search for its controller, as finite
+        elements do: searches then save plants, not controllers.
     nearby : callable, optional
         Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
     shapes, drawing : callable, optional
@@ -153,6 +156,7 @@ class Plant:
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
     domain: tuple[Array, Array] | None = None
     unknown_between: str = ""
+    expensive: bool = False
     nearby: Callable[[Sequence[Sequence[float]]], Evaluate] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     mismatch: Callable[[Sequence[float]], str] = lambda theta: ""

@@ -238,7 +238,7 @@ class Sampler:
         size = min(
             self.chunk, max(1, -(-len(todo) // self.workers.count))
         )  # a few keep all at work
-        if plant_of(self.problem).nearby is not None:  # seconds each: none waits for seven others
+        if plant_of(self.problem).expensive:  # seconds each: none waits for seven others
             size = 1
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
         with Progress(len(todo), label, quiet=self.quiet) as progress:

@@ -113,6 +113,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
             name: remembered(variant.mechanics, False) for name, variant in references.items()
         },
         values=remembered(stage.mechanics, False),
+        expensive=reduced.applies(stage),
         nearby=nearby if reduced.applies(stage) else None,
         shapes=partial(mode_shapes, stage),
         drawing=drawing,
