@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
 # Rooms and modules whose numbers are sizes, colours and positions on a page.
 DRAWING = (
-    "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.explorer.",
+    "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.extensions.explorer.",
     "ccd_casadi.case_studies.rib_stage.pictures", "ccd_casadi.support.terminal",
 )  # fmt: skip
 # Numbers that no algorithm could take otherwise: of physics, units, file formats and other

@@ -16,7 +16,7 @@ LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"
 PROCESSES = {
     ("ccd_casadi/deployment/source_code.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/explorer/known_plant.py", "subprocess.Popen"),
+    ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }
@@ -28,6 +28,7 @@ BY_NAME = {
     "ccd_casadi/kernels/compiled.py",
     "surrogates/lazy_names.py",
     "ccd_casadi/__main__.py",
+    "ccd_casadi/support/extensions.py",
 }
 
 

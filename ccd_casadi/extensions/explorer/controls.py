@@ -25,8 +25,8 @@ from ccd_casadi.drawing.charts import GROUND, RING
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.paint import escape
 from ccd_casadi.drawing.svg import GREEN, ORANGE
-from ccd_casadi.explorer.designs import Knobs
-from ccd_casadi.explorer.painter import FEW, Change
+from ccd_casadi.extensions.explorer.designs import Knobs
+from ccd_casadi.extensions.explorer.painter import FEW, Change
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.nodes import Positions, names_in
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths

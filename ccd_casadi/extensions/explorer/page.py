@@ -16,7 +16,8 @@ from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.paint import escape
-from ccd_casadi.explorer.controls import (
+from ccd_casadi.extensions.explorer import ASSETS
+from ccd_casadi.extensions.explorer.controls import (
     Controls,
     MapFigure,
     PlacesFigure,
@@ -25,7 +26,7 @@ from ccd_casadi.explorer.controls import (
     run_surrogate,
     steepest_axes,
 )
-from ccd_casadi.explorer.curves import (
+from ccd_casadi.extensions.explorer.curves import (
     EMPTY,
     FIGURES,
     LOOKS,
@@ -39,11 +40,17 @@ from ccd_casadi.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.explorer.designs import Designed, How, Knobs, Look, anchored, designed
-from ccd_casadi.explorer.known_plant import Background, Solve
-from ccd_casadi.explorer.painter import ON_DARK, Message, PanelFigure, cursor, legend_html
-from ccd_casadi.explorer.pins import Kept, Pins
-from ccd_casadi.explorer.session import Session, searched_exactly
+from ccd_casadi.extensions.explorer.designs import Designed, How, Knobs, Look, anchored, designed
+from ccd_casadi.extensions.explorer.known_plant import Background, Solve
+from ccd_casadi.extensions.explorer.painter import (
+    ON_DARK,
+    Message,
+    PanelFigure,
+    cursor,
+    legend_html,
+)
+from ccd_casadi.extensions.explorer.pins import Kept, Pins
+from ccd_casadi.extensions.explorer.session import Session, searched_exactly
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -133,7 +140,7 @@ class ExplorerPage:
                     part.sizing_mode = fill
             self.document.add_root(column(*parts, name=name, sizing_mode=fill))
         names = {made.name: made.heading for made in self.figures} | {"landscape": "Landscape"}
-        label = CustomJS(args={"names": names}, code=package_text("explorer/assets/label.js"))
+        label = CustomJS(args={"names": names}, code=package_text(f"{ASSETS}/label.js"))
         self.document.js_on_event(DocumentReady, label)
 
     # drags

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.explorer.designs import Elements
+from ccd_casadi.extensions.explorer.designs import Elements
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, nearby_model
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.user_code import permit_user_code

@@ -14,7 +14,7 @@ from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
-from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.extensions.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -157,7 +157,7 @@ def standing_html(
     `beside`: another design's name and its ω_b in Hz, which the bandwidth is compared with.
     """
     known = beside is not None and np.isfinite(beside[1])
-    return template("explorer/assets/standing.html", number=number, HZ=HZ).render(
+    return template("extensions/explorer/assets/standing.html", number=number, HZ=HZ).render(
         look=look, beside=beside if known else None, curves=curves, sampled=sampled,
     )  # fmt: skip
 

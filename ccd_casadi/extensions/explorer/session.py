@@ -11,8 +11,8 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.explorer.curves import surface_modes_html
-from ccd_casadi.explorer.designs import (
+from ccd_casadi.extensions.explorer.curves import surface_modes_html
+from ccd_casadi.extensions.explorer.designs import (
     Designed,
     Elements,
     How,
@@ -28,7 +28,7 @@ from ccd_casadi.explorer.designs import (
     searched,
     without_controller,
 )
-from ccd_casadi.explorer.known_plant import KnownPlant
+from ccd_casadi.extensions.explorer.known_plant import KnownPlant
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import lumped

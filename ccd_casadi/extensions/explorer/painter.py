@@ -21,6 +21,7 @@ from ccd_casadi.drawing.content import Curve, Panel
 from ccd_casadi.drawing.labels import LINE as TALL
 from ccd_casadi.drawing.labels import SIZE, Labels
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, THEME, VARIABLES
+from ccd_casadi.extensions.explorer import ASSETS
 from ccd_casadi.support.text import package_text
 
 Change = tuple[Model, dict[str, Any]]  # a model, and new values of its properties
@@ -38,7 +39,7 @@ class Message(DataModel):
 
     def applied_in(self, document: Document) -> None:
         """Have the browser apply what comes, and what came before the page was there."""
-        apply = CustomJS(args={"message": self}, code=package_text("explorer/assets/apply.js"))
+        apply = CustomJS(args={"message": self}, code=package_text(f"{ASSETS}/apply.js"))
         self.js_on_change("content", apply)
         document.js_on_event(DocumentReady, apply)
 
@@ -118,7 +119,7 @@ class PanelFigure:
             x_axis_type="log" if self._log_x else "linear",
             y_axis_type="log" if self._log_y else "linear",
         )  # fmt: skip
-        made.js_on_event(Reset, models.CustomJS(code=package_text("explorer/assets/follow.js")))
+        made.js_on_event(Reset, models.CustomJS(code=package_text(f"{ASSETS}/follow.js")))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
@@ -132,7 +133,7 @@ class PanelFigure:
                 if isinstance(tool, models.WheelZoomTool):
                     tool.zoom_on_axis = False
             fit = models.CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)},
-                           code=package_text("explorer/assets/round.js"))  # fmt: skip
+                           code=package_text(f"{ASSETS}/round.js"))  # fmt: skip
             for size in ("inner_width", "inner_height"):
                 made.js_on_change(size, fit)
         return made

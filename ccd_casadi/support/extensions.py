@@ -1,0 +1,147 @@
+"""The table of extensions: what is found by name, and imported when it is first used.
+
+An extension is a module or package of `ccd_casadi.extensions`, or of another distribution behind an
+entry point of that group. It declares an `Extension`, and imports nothing heavy to do so.
+"""
+
+import pkgutil
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import MappingProxyType
+from typing import Any
+
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import ExitCode
+from ccd_casadi.support.terminal import say
+
+GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other distributions
+# Command -> the extension of this distribution that has it, for the message where it was removed.
+SHIPPED = MappingProxyType({"explore": "explorer"})
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What an extension adds, by names of what is imported: "module:name" where not said.
+
+    Attributes
+    ----------
+    commands : mapping
+        Word -> the module of its `main`, and what it does.
+    """
+
+    commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+
+@cache
+def shipped() -> dict[str, Extension]:
+    """Read the extensions of this distribution.
+
+    Returns
+    -------
+    dict of str to Extension
+        By the name of their module, sorted.
+    """
+    places = import_module(GROUP).__path__
+    names = sorted(found.name for found in pkgutil.iter_modules(places))
+    return {name: import_module(f"{GROUP}.{name}").EXTENSION for name in names}
+
+
+@cache
+def installed() -> dict[str, Extension]:
+    """Read all extensions, those of other distributions last.
+
+    Returns
+    -------
+    dict of str to Extension
+    """
+    return shipped() | {point.name: point.load() for point in entry_points(group=GROUP)}
+
+
+def declared(kind: str) -> dict[str, Any]:
+    """Collect what all extensions declare of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        A field of `Extension`.
+
+    Returns
+    -------
+    dict
+    """
+    return {k: v for item in installed().values() for k, v in getattr(item, kind).items()}
+
+
+def find(kind: str, name: str) -> Any:
+    """Look for what an extension declares; other distributions are read where none here has it.
+
+    Parameters
+    ----------
+    kind, name : str
+        A field of `Extension`, and a key of that.
+
+    Returns
+    -------
+    object or None
+    """
+    for extensions in (shipped, installed):
+        for item in extensions().values():
+            if name in getattr(item, kind):
+                return getattr(item, kind)[name]
+    return None
+
+
+def load(place: str) -> Any:
+    """Import what "module:name" names.
+
+    Parameters
+    ----------
+    place : str
+
+    Returns
+    -------
+    object
+    """
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def missing(subject: str, extension: str) -> UserError:
+    """Make the error of what needs an extension that was removed.
+
+    Parameters
+    ----------
+    subject, extension : str
+
+    Returns
+    -------
+    UserError
+    """
+    return UserError(f"{subject} needs the extension {extension}, which is not installed")
+
+
+def command(word: str) -> Callable[..., int]:
+    """Make the entry point of an extension's command, which is imported when it is called.
+
+    Parameters
+    ----------
+    word : str
+
+    Returns
+    -------
+    callable
+        Takes a list of words; BAD_INPUT where the extension was removed.
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        found = find("commands", word)
+        if found is None:
+            say(str(missing(f"`{word}`", SHIPPED.get(word, word))), sys.stderr)
+            return ExitCode.BAD_INPUT
+        return int(import_module(found[0]).main(argv))
+
+    return main

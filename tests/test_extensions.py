@@ -1,0 +1,90 @@
+"""The core works without its extensions: each is removed in a copy of the package."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from oracles.sources import ROOT
+
+from ccd_casadi.support import extensions
+from ccd_casadi.support.extensions import SHIPPED, Extension, shipped
+
+NAMES = sorted(shipped())
+IMPORTS = """
+import pkgutil, ccd_casadi
+for found in pkgutil.walk_packages(ccd_casadi.__path__, "ccd_casadi."):
+    if not found.name.startswith("ccd_casadi.extensions.") and "__main__" not in found.name:
+        __import__(found.name)
+"""
+
+
+def run_without(place: Path, *removed: str, words: list[str]) -> "subprocess.CompletedProcess[str]":
+    """A Python process on a copy of the package, of links: its compiled kernels are shared."""
+    copy = place / "ccd_casadi"
+    for folder, skipped in (("", {"extensions"}), ("extensions", set(removed))):
+        (copy / folder).mkdir(parents=True, exist_ok=True)
+        for item in (ROOT / "ccd_casadi" / folder).iterdir():
+            if item.stem not in skipped and not (copy / folder / item.name).is_symlink():
+                (copy / folder / item.name).symlink_to(item)
+    if not (place / "surrogates").is_symlink():
+        (place / "surrogates").symlink_to(ROOT / "surrogates")
+    environment = os.environ | {"PYTHONPATH": str(place)}
+    return subprocess.run(
+        [sys.executable, *words], cwd=place, env=environment, capture_output=True, text=True
+    )
+
+
+def solve_words(place: Path, *more: str) -> list[str]:
+    case = str(ROOT / "runs" / "two_mass.toml")
+    return ["-m", "ccd_casadi.solve", case, "--out", str(place / "run"), "--quiet", *more]
+
+
+def test_every_extension_of_a_message_is_there() -> None:
+    assert set(SHIPPED.values()) <= set(NAMES)
+    for name, extension in shipped().items():
+        there = {*extension.commands}
+        assert there == {word for word, of in SHIPPED.items() if of == name}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_command_of_a_removed_extension_answers_by_name(name: str, tmp_path: Path) -> None:
+    for word in shipped()[name].commands:
+        for words in (["-m", f"ccd_casadi.{word}"], ["-m", "ccd_casadi", word]):
+            done = run_without(tmp_path, name, words=words)
+            expected = f"`{word}` needs the extension {name}, which is not installed\n"
+            assert (done.returncode, done.stderr) == (2, expected)
+    done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "foo"])
+    assert done.returncode == 2
+    assert all(f" {word}," not in done.stderr for word in shipped()[name].commands)
+
+
+def test_the_core_solves_without_any_extension(tmp_path: Path) -> None:
+    done = run_without(tmp_path, *NAMES, words=["-c", IMPORTS])
+    assert (done.returncode, done.stderr) == (0, "")
+    words = solve_words(tmp_path, "--formulation", "lifted", "--no-report")
+    done = run_without(tmp_path, *NAMES, words=words)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_the_core_solves_without_each_extension(name: str, tmp_path: Path) -> None:
+    done = run_without(tmp_path, name, words=["-c", IMPORTS])
+    assert (done.returncode, done.stderr) == (0, "")
+    done = run_without(tmp_path, name, words=solve_words(tmp_path))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = Extension(commands={"drive": ("my_package.drive", "move it")})
+    point = SimpleNamespace(name="drives", load=lambda: own)
+    monkeypatch.setattr(extensions, "entry_points", lambda group: [point])
+    extensions.installed.cache_clear()
+    try:
+        assert extensions.find("commands", "drive") == own.commands["drive"]
+        assert set(extensions.declared("commands")) == {*SHIPPED, "drive"}
+    finally:
+        extensions.installed.cache_clear()
