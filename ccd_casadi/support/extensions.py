@@ -20,7 +20,7 @@ from ccd_casadi.support.terminal import say
 
 GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other distributions
 # Command -> the extension of this distribution that has it, for the message where it was removed.
-SHIPPED = MappingProxyType({"explore": "explorer"})
+SHIPPED = MappingProxyType({"explore": "explorer", "record": "records"})
 
 
 @dataclass(frozen=True)

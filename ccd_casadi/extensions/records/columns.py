@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ccd_casadi.extensions.records.signal_names import unit_factor
 from ccd_casadi.plants.table_columns import npz_arrays, texts_of
-from ccd_casadi.records.signal_names import unit_factor
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.text_table import (

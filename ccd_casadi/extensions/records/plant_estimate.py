@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from ccd_casadi.records.local_polynomial import WindowOptions, fit_locally
-from ccd_casadi.records.time_series import TimeSeries
+from ccd_casadi.extensions.records.local_polynomial import WindowOptions, fit_locally
+from ccd_casadi.extensions.records.time_series import TimeSeries
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 

@@ -5,7 +5,7 @@ from io import BytesIO
 import numpy as np
 
 from ccd_casadi.drawing.svg import BLUE, GREY, log_axis, new_figure, place, style
-from ccd_casadi.records.plant_estimate import PlantEstimate
+from ccd_casadi.extensions.records.plant_estimate import PlantEstimate
 from ccd_casadi.support.text import spoken
 
 WIDTH, LEFT, RIGHT = 8.0, 0.85, 0.2  # inches

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.records.plant_estimate import EstimateOptions, PlantEstimate
+from ccd_casadi.extensions.records.plant_estimate import EstimateOptions, PlantEstimate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import counted
 
