@@ -21,13 +21,13 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem
 from ccd_casadi.inner_problem.problem import scaled_plant as scaled_plant
 from ccd_casadi.inner_problem.problem import true_design as true_design
 from ccd_casadi.inner_problem.problem import true_inner as true_inner
-from ccd_casadi.interop.frames import samples_frame as samples_frame
 from ccd_casadi.lti.loop import Sampling as Sampling
 from ccd_casadi.plants.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace
 from ccd_casadi.robust.study import robustness as robustness
+from ccd_casadi.sampling.frames import samples_frame as samples_frame
 from ccd_casadi.studies.comparison import compare as compare
 from ccd_casadi.studies.tuning import Tuned as Tuned
 from ccd_casadi.studies.tuning import tune as tune
