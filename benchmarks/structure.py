@@ -23,18 +23,18 @@ OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
 DRAWING = (
     "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.extensions.explorer.",
     "ccd_casadi.extensions.records.picture",
-    "ccd_casadi.case_studies.rib_stage.pictures", "ccd_casadi.support.terminal",
+    "ccd_casadi.extensions.rib_stage.pictures", "ccd_casadi.support.terminal",
 )  # fmt: skip
 # Numbers that no algorithm could take otherwise: of physics, units, file formats and other
 # programs' interfaces, of the machine's rounding; indices; nodes of a quadrature.
 EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.budget.evaluation": ("COMPLEX_STEP",),
     "ccd_casadi.budget.error_density": ("_X", "_W", "_G", "NODES", "KRONROD", "GAUSS"),
-    "ccd_casadi.case_studies.rib_stage.assembly": ("COPIES",),
-    "ccd_casadi.case_studies.rib_stage.geometry": ("LOWER", "UPPER"),
-    "ccd_casadi.case_studies.rib_stage.mesh": ("PAIRS",),
-    "ccd_casadi.case_studies.rib_stage.model": ("ROWS",),
-    "ccd_casadi.case_studies.rib_stage.reduced": ("RIGID",),
+    "ccd_casadi.extensions.rib_stage.assembly": ("COPIES",),
+    "ccd_casadi.extensions.rib_stage.geometry": ("LOWER", "UPPER"),
+    "ccd_casadi.extensions.rib_stage.mesh": ("PAIRS",),
+    "ccd_casadi.extensions.rib_stage.model": ("ROWS",),
+    "ccd_casadi.extensions.rib_stage.reduced": ("RIGID",),
     "ccd_casadi.cases.checks": ("LARGEST", "SMALLEST"),
     "ccd_casadi.cases.findings": ("MASS", "STIFFNESS"),
     "ccd_casadi.codesign.lifted_kkt": ("HALF_POWER",),
@@ -54,8 +54,8 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.kernels.modes": ("SIMPLE", "POSITION", "VELOCITY"),
     "ccd_casadi.kernels.sections": ("HALF_POWER", "GAIN", "INTEGRATOR", "REAL", "PAIR"),
     "ccd_casadi.kernels.sensitivity": ("HALF_POWER",),
-    "ccd_casadi.plants.cad.elastic_body": ("AXES", "OUTWARD"),
-    "ccd_casadi.plants.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
+    "ccd_casadi.extensions.cad.elastic_body": ("AXES", "OUTWARD"),
+    "ccd_casadi.extensions.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
     "ccd_casadi.plants.rigid_modes": ("EPS",),
     "ccd_casadi.plants.table_columns": ("COMPLIANCE", "RATES", "RATE_NAMES"),
     "ccd_casadi.extensions.records.signal_names": ("UNITS",),

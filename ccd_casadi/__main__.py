@@ -29,7 +29,6 @@ COMMANDS = {
     "deploy": ("ccd_casadi.deploy", "write a run's controller as C, .mat and structured text"),
     "report": ("ccd_casadi.report", "draw the pages of a finished folder again"),
     "cross_check": ("ccd_casadi.cross_check", "compare one synthesis by every back end"),
-    "imported": ("ccd_casadi.imported", "make a modal table from result files; also: ccd import"),
 }
 ALIASES = {"import": "imported"}
 TEMPLATE = ("plant.py", "case.toml")
@@ -47,7 +46,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     named = ALIASES.get(words[0], words[0]) if words else ""
     if named in COMMANDS:
         return int(import_module(COMMANDS[named][0]).main(words[1:]))
-    if named in extensions.SHIPPED or (_is_new(named) and extensions.find("commands", named)):
+    if named in extensions.SHIPPED["commands"] or (
+        _is_new(named) and extensions.find("commands", named)
+    ):
         return extensions.command(named)(words[1:])
     raise_on_ctrl_c()
     match words:

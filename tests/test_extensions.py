@@ -12,6 +12,7 @@ from oracles.sources import ROOT
 from ccd_casadi.support import extensions
 from ccd_casadi.support.extensions import SHIPPED, Extension, shipped
 
+CASE = ROOT / "runs" / "two_mass.toml"
 NAMES = sorted(shipped())
 IMPORTS = """
 import pkgutil, ccd_casadi
@@ -38,24 +39,28 @@ def run_without(place: Path, *removed: str, words: list[str]) -> "subprocess.Com
 
 
 def solve_words(place: Path, *more: str) -> list[str]:
-    case = str(ROOT / "runs" / "two_mass.toml")
-    return ["-m", "ccd_casadi.solve", case, "--out", str(place / "run"), "--quiet", *more]
+    return ["-m", "ccd_casadi.solve", str(CASE), "--out", str(place / "run"), "--quiet", *more]
 
 
 def test_every_extension_of_a_message_is_there() -> None:
-    assert set(SHIPPED.values()) <= set(NAMES)
-    for name, extension in shipped().items():
-        there = {*extension.commands}
-        assert there == {word for word, of in SHIPPED.items() if of == name}
+    for kind, of in SHIPPED.items():
+        there = {word: name for name, item in shipped().items() for word in getattr(item, kind)}
+        assert there == of
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_command_of_a_removed_extension_answers_by_name(name: str, tmp_path: Path) -> None:
+def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: Path) -> None:
     for word in shipped()[name].commands:
         for words in (["-m", f"ccd_casadi.{word}"], ["-m", "ccd_casadi", word]):
             done = run_without(tmp_path, name, words=words)
             expected = f"`{word}` needs the extension {name}, which is not installed\n"
             assert (done.returncode, done.stderr) == (2, expected)
+    for model in shipped()[name].plants:
+        case = tmp_path / "case.toml"
+        case.write_text(CASE.read_text().replace('"two_mass"', f'"{model}"'))
+        done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "check", str(case)])
+        words = f"'{model}' needs the extension {name}, which is not installed"
+        assert (done.returncode, done.stderr) == (2, f"{case}: plant.model: {words}\n")
     done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "foo"])
     assert done.returncode == 2
     assert all(f" {word}," not in done.stderr for word in shipped()[name].commands)
@@ -85,6 +90,6 @@ def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) ->
     extensions.installed.cache_clear()
     try:
         assert extensions.find("commands", "drive") == own.commands["drive"]
-        assert set(extensions.declared("commands")) == {*SHIPPED, "drive"}
+        assert set(extensions.declared("commands")) == {*SHIPPED["commands"], "drive"}
     finally:
         extensions.installed.cache_clear()

@@ -14,13 +14,16 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any
 
-from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.terminal import say
 
 GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other distributions
-# Command -> the extension of this distribution that has it, for the message where it was removed.
-SHIPPED = MappingProxyType({"explore": "explorer", "record": "records"})
+# What the extensions of this distribution have, for the message where one was removed.
+SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
+    "commands": {"explore": "explorer", "imported": "imported", "record": "records"},
+    "plants": {"cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
+               "sampled_matrices": "imported"},
+})  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -31,9 +34,12 @@ class Extension:
     ----------
     commands : mapping
         Word -> the module of its `main`, and what it does.
+    plants : mapping
+        Name in a case file -> its `plants.registry.Model`.
     """
 
     commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    plants: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache
@@ -110,18 +116,20 @@ def load(place: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def missing(subject: str, extension: str) -> UserError:
-    """Make the error of what needs an extension that was removed.
+def missing(subject: str, kind: str, name: str) -> str:
+    """Say that something needs an extension that was removed.
 
     Parameters
     ----------
-    subject, extension : str
+    subject : str
+    kind, name : str
+        What the extension has; as in `find`.
 
     Returns
     -------
-    UserError
+    str
     """
-    return UserError(f"{subject} needs the extension {extension}, which is not installed")
+    return f"{subject} needs the extension {SHIPPED[kind][name]}, which is not installed"
 
 
 def command(word: str) -> Callable[..., int]:
@@ -140,7 +148,7 @@ def command(word: str) -> Callable[..., int]:
     def main(argv: Sequence[str] | None = None) -> int:
         found = find("commands", word)
         if found is None:
-            say(str(missing(f"`{word}`", SHIPPED.get(word, word))), sys.stderr)
+            say(missing(f"`{word}`", "commands", word), sys.stderr)
             return ExitCode.BAD_INPUT
         return int(import_module(found[0]).main(argv))
 

@@ -37,7 +37,7 @@ def test_every_word_has_a_command_and_the_entry_point_is_there() -> None:
     words = {f"{p.parent.name}.{p.stem}" for p in every if "\n@command(" in p.read_text()}
     assert words == {module for module, _ in COMMANDS.values() if module.count(".") == 1}
     thin = {p.stem for p in every if "\nmain = command(" in p.read_text()}
-    assert thin == set(extensions.SHIPPED) == {
+    assert thin == set(extensions.SHIPPED["commands"]) == {
         word for word, (module, _) in COMMANDS.items() if module.count(".") > 1
     }
     assert set(ALIASES.values()) <= set(COMMANDS)

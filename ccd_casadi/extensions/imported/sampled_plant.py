@@ -8,11 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.interpolation import Errors, InterpolatedModes, row_of
-from ccd_casadi.plants.imported.matrices import reduced_table
-from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
-from ccd_casadi.plants.imported.mode_matching import fit_entries
+from ccd_casadi.extensions.imported.interpolation import Errors, InterpolatedModes, row_of
+from ccd_casadi.extensions.imported.matrices import reduced_table
+from ccd_casadi.extensions.imported.modal_table import ModalTable, read_modal_table
+from ccd_casadi.extensions.imported.mode_matching import fit_entries
 from ccd_casadi.plants.plant import Plant, named_values
+from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.errors import PlantError
 
 NEAREST = "the nearest sample as it stands"
@@ -166,3 +167,7 @@ def _notes(modes: InterpolatedModes, source: str, theta: Sequence[float]) -> tup
         f"to {frequency:.2g} % in frequency and {response:.2g} % in response at worst",
         f"this theta {here}, {place}; analyse its own finite-element model before it is built",
     )
+
+
+MODAL_TABLE = Model(modal_table, data="table", annotated=True)
+SAMPLED_MATRICES = Model(sampled_matrices, data="folder", annotated=True)

@@ -6,8 +6,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ccd_casadi.case_studies.rib_stage.geometry import Material, Point
-from ccd_casadi.case_studies.rib_stage.mesh import PAIRS, Block, Mesh, cube_mass, cube_stiffness
+from ccd_casadi.extensions.rib_stage.geometry import Point
+from ccd_casadi.extensions.rib_stage.mesh import PAIRS, Block, Mesh, cube_mass, cube_stiffness
+from ccd_casadi.plants.material import Material
 from ccd_casadi.support.arrays import Array
 
 

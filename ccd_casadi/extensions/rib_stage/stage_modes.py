@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import qr
 
-from ccd_casadi.case_studies.rib_stage.assembly import (
+from ccd_casadi.extensions.rib_stage.assembly import (
     ALL,
     AS,
     SA,
@@ -28,14 +28,8 @@ from ccd_casadi.case_studies.rib_stage.assembly import (
     point_functional,
     swap_displacements,
 )
-from ccd_casadi.case_studies.rib_stage.geometry import (
-    Geometry,
-    Material,
-    Point,
-    PointMass,
-    has_square_symmetry,
-)
-from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder, build_mesh
+from ccd_casadi.extensions.rib_stage.geometry import Geometry, Point, PointMass, has_square_symmetry
+from ccd_casadi.extensions.rib_stage.mesh import MeshOrder, build_mesh
 from ccd_casadi.plants.eigenpairs import (
     Pencil,
     build_pencil,
@@ -43,6 +37,7 @@ from ccd_casadi.plants.eigenpairs import (
     flexible_modes,
     orthonormal,
 )
+from ccd_casadi.plants.material import Material
 from ccd_casadi.support.arrays import Array
 
 

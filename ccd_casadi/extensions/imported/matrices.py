@@ -13,7 +13,7 @@ from scipy.sparse import csc_array, issparse
 from scipy.sparse import load_npz as load_sparse
 from scipy.sparse.linalg import eigsh, splu
 
-from ccd_casadi.plants.imported.modal_table import ModalTable, Rows, number_in, read_rows
+from ccd_casadi.extensions.imported.modal_table import ModalTable, Rows, number_in, read_rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 

@@ -10,12 +10,14 @@ import numpy as np
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.surface import surface_figure
 from ccd_casadi.drawing.svg import ModeShapes
-from ccd_casadi.plants.cad.elastic_body import Body, Material, mode_shapes, reduced, surface
-from ccd_casadi.plants.cad.morph import Morph, read_morph
-from ccd_casadi.plants.cad.solid import volumes
+from ccd_casadi.extensions.cad.elastic_body import Body, mode_shapes, reduced, surface
+from ccd_casadi.extensions.cad.morph import Morph, read_morph
+from ccd_casadi.extensions.cad.solid import volumes
 from ccd_casadi.plants.differenced import remembered
 from ccd_casadi.plants.fixed_parameters import with_fixed
+from ccd_casadi.plants.material import Material
 from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import PlantError, require
@@ -222,3 +224,6 @@ def _one_of(key: str, name: str, known: tuple[str, ...]) -> str:
     if name not in known:
         raise PlantError(f"{key}: {name!r} is none of {', '.join(known)}; correct it")
     return name
+
+
+MODEL = Model(cad_stage, data="morph", annotated=True)

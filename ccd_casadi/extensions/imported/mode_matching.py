@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
-from ccd_casadi.plants.imported.modal_table import ModalTable
+from ccd_casadi.extensions.imported.modal_table import ModalTable
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 

@@ -6,18 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from ccd_casadi.case_studies.rib_stage.assembly import mirror_signs, swap_displacements
-from ccd_casadi.case_studies.rib_stage.geometry import (
-    NAMES,
-    Geometry,
-    axis_lengths,
-    bays,
-    has_square_symmetry,
-    mass,
-)
-from ccd_casadi.case_studies.rib_stage.mesh import Mesh
-from ccd_casadi.case_studies.rib_stage.model import ModeCount, RibStage, discretisation, modes_at
-from ccd_casadi.case_studies.rib_stage.stage_modes import sector_of
 from ccd_casadi.drawing.content import Area, Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.svg import (
     BLACK,
@@ -28,6 +16,18 @@ from ccd_casadi.drawing.svg import (
     outer_faces,
     short_label,
 )
+from ccd_casadi.extensions.rib_stage.assembly import mirror_signs, swap_displacements
+from ccd_casadi.extensions.rib_stage.geometry import (
+    NAMES,
+    Geometry,
+    axis_lengths,
+    bays,
+    has_square_symmetry,
+    mass,
+)
+from ccd_casadi.extensions.rib_stage.mesh import Mesh
+from ccd_casadi.extensions.rib_stage.model import ModeCount, RibStage, discretisation, modes_at
+from ccd_casadi.extensions.rib_stage.stage_modes import sector_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import number
 

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ccd_casadi.plants.imported.modal_table import ModalTable
-from ccd_casadi.plants.imported.mode_matching import Frame, fit_entries, frames
+from ccd_casadi.extensions.imported.modal_table import ModalTable
+from ccd_casadi.extensions.imported.mode_matching import Frame, fit_entries, frames
 from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.case_studies.rib_stage import geometry as shape
-from ccd_casadi.case_studies.rib_stage.assembly import AS, SA
-from ccd_casadi.case_studies.rib_stage.geometry import (
+from ccd_casadi.extensions.rib_stage import geometry as shape
+from ccd_casadi.extensions.rib_stage.assembly import AS, SA
+from ccd_casadi.extensions.rib_stage.geometry import (
     RIGID_NAMES,
     Geometry,
     Point,
@@ -20,8 +20,8 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
     rigid_fields,
     rigid_values,
 )
-from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
-from ccd_casadi.case_studies.rib_stage.stage_modes import (
+from ccd_casadi.extensions.rib_stage.mesh import MeshOrder
+from ccd_casadi.extensions.rib_stage.stage_modes import (
     Discretisation,
     Group,
     GroupModes,

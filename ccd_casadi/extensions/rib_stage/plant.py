@@ -6,10 +6,12 @@ from functools import partial
 
 import casadi as ca
 
-from ccd_casadi.case_studies.rib_stage import reduced
-from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
-from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
-from ccd_casadi.case_studies.rib_stage.model import (
+from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
+from ccd_casadi.drawing.content import Figure
+from ccd_casadi.extensions.rib_stage import reduced
+from ccd_casadi.extensions.rib_stage.geometry import NAMES, Geometry, Point, PointMass
+from ccd_casadi.extensions.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.extensions.rib_stage.model import (
     FORTY_FOUR,
     OUTPUTS,
     ROWS,
@@ -17,12 +19,11 @@ from ccd_casadi.case_studies.rib_stage.model import (
     ModeCount,
     RibStage,
 )
-from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
-from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
-from ccd_casadi.drawing.content import Figure
+from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
 from ccd_casadi.plants.differenced import remembered
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.fixed_parameters import with_fixed
+from ccd_casadi.plants.material import Material
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 
@@ -90,7 +91,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         return remembered(lambda theta, _: reduced.mechanics(stage, made, theta))
 
     def drawing(thetas: Mapping[str, Sequence[float]]) -> Figure:
-        from ccd_casadi.case_studies.rib_stage import pictures  # matplotlib is slow to import
+        from ccd_casadi.extensions.rib_stage import pictures
 
         return pictures.drawing(stage.geometry, thetas)
 

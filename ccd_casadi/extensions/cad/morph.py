@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.plants.cad import solid
+from ccd_casadi.extensions.cad import solid
 from ccd_casadi.plants.plant import named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -171,7 +171,7 @@ def read_morph(file: str | Path) -> Morph:
             names = tuple(map(str, data["names"]))
             return Morph(names, faces=faces, error=float(data["error"]), **fields)
     except Exception as error:
-        words = "write it with ccd_casadi.plants.cad.draw_morph"
+        words = "write it with ccd_casadi.extensions.cad.draw_morph"
         raise PlantError(f"{Path(file).name}: is not a morphed mesh ({error}); {words}") from None
 
 
