@@ -43,7 +43,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.fixed_structure.discs": ("GUARD",),
     "ccd_casadi.inner_problem.kinds": ("ENDS",),
     "ccd_casadi.inner_problem.problem": ("NUMERICS",),
-    "ccd_casadi.limitations.limits": ("ROOT_HALF",),
+    "ccd_casadi.extensions.limitations.limits": ("ROOT_HALF",),
     "ccd_casadi.kernels.adjoint": ("ROUNDING",),
     "ccd_casadi.kernels.loop_certificate": ("EPS",),
     "ccd_casadi.kernels.gamma": ("BACKWARD",),

@@ -18,7 +18,6 @@ from ccd_casadi.support.text import package_text, template
 COMMANDS = {
     "check": ("ccd_casadi.check", "examine a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "find the best controller at one theta, as JSON"),
-    "gap": ("ccd_casadi.gap", "bound what any controller reaches at one theta, as JSON"),
     "tune": ("ccd_casadi.tune", "find the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "design stage and controller together, verify, report"),
     "compare": ("ccd_casadi.compare", "run every method on a case, side by side"),

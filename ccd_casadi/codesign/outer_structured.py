@@ -42,11 +42,11 @@ from ccd_casadi.inner_problem.structured_plant_set import structure_of, structur
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
-from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.units import NeighbourOptions
+from ccd_casadi.support import extensions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.process_pool import Workers, results
@@ -208,7 +208,8 @@ class StructuredOuter(ThetaOuter):
             kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
-            gap = known_gap(problem, best.theta)
+            known_gap = extensions.function("known_gap")
+            gap = None if known_gap is None else known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
             survival = survived(problem, loops, design)[0]
             damping, told = other_damping(problem, loops), None
@@ -272,7 +273,9 @@ def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) ->
     """Whether it is shown that J is at least that at θ."""
     if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
         return False
-    return none_reaches(problem, theta, (least - objective(problem, theta, 0.0)) / problem.w2)
+    none_reaches = extensions.function("none_reaches")
+    reached = (least - objective(problem, theta, 0.0)) / problem.w2
+    return none_reaches is not None and none_reaches(problem, theta, reached)
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue | None) -> float:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
@@ -36,7 +36,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     with_structured,
 )
-from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
@@ -63,6 +62,16 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))
+
+
+class Gap(Protocol):
+    """What is known of every controller, of the extension `limitations`."""
+
+    def words(self, bandwidth: float) -> str:
+        """Of the verdict, with a design's ω_b in rad/s."""
+
+    def entry(self, bandwidth: float) -> dict[str, Any]:
+        """Of result.json."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.terminal import say
@@ -20,9 +20,12 @@ from ccd_casadi.support.terminal import say
 GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other distributions
 # What the extensions of this distribution have, for the message where one was removed.
 SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
-    "commands": {"explore": "explorer", "imported": "imported", "record": "records"},
+    "commands": {
+        "explore": "explorer", "gap": "limitations", "imported": "imported", "record": "records",
+    },
     "plants": {"cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
                "sampled_matrices": "imported"},
+    "functions": {"known_gap": "limitations", "none_reaches": "limitations"},
 })  # fmt: skip
 
 
@@ -36,10 +39,13 @@ class Extension:
         Word -> the module of its `main`, and what it does.
     plants : mapping
         Name in a case file -> its `plants.registry.Model`.
+    functions : mapping
+        Name -> what the core calls where it is there.
     """
 
     commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     plants: Mapping[str, str] = field(default_factory=dict)
+    functions: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache
@@ -114,6 +120,21 @@ def load(place: str) -> Any:
     """
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
+
+
+def function(name: str) -> Callable[..., Any] | None:
+    """Import a function that the core calls where an extension has it.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    callable or None
+    """
+    place = find("functions", name)
+    return None if place is None else cast(Callable[..., Any], load(place))
 
 
 def missing(subject: str, kind: str, name: str) -> str:

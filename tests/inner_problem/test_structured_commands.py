@@ -23,6 +23,9 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.extensions.limitations.limits import discs
+from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
+from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
@@ -33,9 +36,6 @@ from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
-from ccd_casadi.limitations.limits import discs
-from ccd_casadi.limitations.multiplier import MultiplierBasis
-from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.reporting.decision import ConditionOptions
 from ccd_casadi.reporting.run_verdict import advice

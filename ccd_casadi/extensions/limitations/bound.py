@@ -6,8 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ccd_casadi.limitations.limits import Limits, discs
-from ccd_casadi.limitations.multiplier import MultiplierBasis, greatest_multiplier, least_scaling
+from ccd_casadi.extensions.limitations.limits import Limits, discs
+from ccd_casadi.extensions.limitations.multiplier import (
+    MultiplierBasis,
+    greatest_multiplier,
+    least_scaling,
+)
 from ccd_casadi.support.arrays import Array
 
 

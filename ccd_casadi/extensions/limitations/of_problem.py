@@ -7,6 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.extensions.limitations.bound import (
+    forbids,
+    forbids_most,
+    lower_bound,
+    pointwise,
+    upper_bound,
+)
+from ccd_casadi.extensions.limitations.limits import Limits, limits_of
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -19,8 +27,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.limitations.bound import forbids, forbids_most, lower_bound, pointwise, upper_bound
-from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
