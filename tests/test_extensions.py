@@ -61,6 +61,10 @@ def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: P
         done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "check", str(case)])
         words = f"'{model}' needs the extension {name}, which is not installed"
         assert (done.returncode, done.stderr) == (2, f"{case}: plant.model: {words}\n")
+    if name == "cluster":
+        done = run_without(tmp_path, name, words=solve_words(tmp_path, "--scheduler", "tcp://a:1"))
+        expected = "--scheduler needs the extension cluster, which is not installed\n"
+        assert (done.returncode, done.stderr) == (2, expected)
     done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "foo"])
     assert done.returncode == 2
     assert all(f" {word}," not in done.stderr for word in shipped()[name].commands)

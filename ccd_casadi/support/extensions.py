@@ -25,7 +25,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     },
     "plants": {"cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
                "sampled_matrices": "imported"},
-    "functions": {"known_gap": "limitations", "none_reaches": "limitations"},
+    "functions": {"cluster": "cluster", "known_gap": "limitations", "none_reaches": "limitations"},
 })  # fmt: skip
 
 

@@ -22,7 +22,6 @@ from typing import Any, Self
 
 from ccd_casadi.inner_problem.problem import NUMERICS
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message, one_blas_thread
 
 
@@ -36,26 +35,6 @@ class ClusterOptions:
 
 
 _one_task = threading.Lock()
-
-
-def pool(scheduler: str | None, count: int, patience: float) -> Pool:
-    """Make the pool of a command: local processes, or a Dask cluster.
-
-    Parameters
-    ----------
-    scheduler : str or None
-        Address of a Dask scheduler; None: local processes.
-    count : int
-        Local processes at most.
-    patience : float
-        Work in s below which no local processes are started.
-
-    Returns
-    -------
-    Pool
-        A context manager that has not been entered.
-    """
-    return Workers(count, patience) if scheduler is None else Cluster(scheduler)
 
 
 class Cluster:
