@@ -22,7 +22,7 @@ OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
 # Rooms and modules whose numbers are sizes, colours and positions on a page.
 DRAWING = (
     "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.extensions.explorer.",
-    "ccd_casadi.extensions.records.picture",
+    "ccd_casadi.extensions.records.picture", "ccd_casadi.extensions.measured.page",
     "ccd_casadi.extensions.rib_stage.pictures", "ccd_casadi.support.terminal",
 )  # fmt: skip
 # Numbers that no algorithm could take otherwise: of physics, units, file formats and other
@@ -60,7 +60,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.plants.table_columns": ("COMPLIANCE", "RATES", "RATE_NAMES"),
     "ccd_casadi.extensions.records.signal_names": ("UNITS",),
     "ccd_casadi.sampling.store": ("SCHEMA",),
-    "ccd_casadi.studies.backends": ("BISECT", "SUBOPTIMAL"),
+    "ccd_casadi.extensions.cross_check.backends": ("BISECT", "SUBOPTIMAL"),
     "ccd_casadi.synthesis.closed_loop": ("EPS",),
     "ccd_casadi.synthesis.matlab_systems": ("SECONDS",),
     "ccd_casadi.support.text": ("HZ",),

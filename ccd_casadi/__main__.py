@@ -18,16 +18,13 @@ from ccd_casadi.support.text import package_text, template
 COMMANDS = {
     "check": ("ccd_casadi.check", "examine a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "find the best controller at one theta, as JSON"),
-    "tune": ("ccd_casadi.tune", "find the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "design stage and controller together, verify, report"),
     "compare": ("ccd_casadi.compare", "run every method on a case, side by side"),
-    "worth": ("ccd_casadi.worth", "estimate in seconds what co-design gains"),
     "retrain": ("ccd_casadi.retrain", "add true samples to a run where they help most"),
     "insight": ("ccd_casadi.insight", "trade hardware cost against bandwidth"),
     "robustness": ("ccd_casadi.robustness", "find what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "write a run's controller as C, .mat and structured text"),
     "report": ("ccd_casadi.report", "draw the pages of a finished folder again"),
-    "cross_check": ("ccd_casadi.cross_check", "compare one synthesis by every back end"),
 }
 ALIASES = {"import": "imported"}
 TEMPLATE = ("plant.py", "case.toml")

@@ -21,11 +21,18 @@ GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other d
 # What the extensions of this distribution have, for the message where one was removed.
 SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "commands": {
-        "explore": "explorer", "gap": "limitations", "imported": "imported", "record": "records",
+        "cross_check": "cross_check", "explore": "explorer", "gap": "limitations",
+        "imported": "imported", "record": "records", "tune": "measured", "worth": "worth",
     },
-    "plants": {"cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
-               "sampled_matrices": "imported"},
-    "functions": {"cluster": "cluster", "known_gap": "limitations", "none_reaches": "limitations"},
+    "plants": {
+        "cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
+        "sampled_matrices": "imported",
+    },
+    "functions": {
+        "cluster": "cluster", "known_gap": "limitations", "measured_answer": "measured",
+        "measured_page": "measured",
+        "none_reaches": "limitations",
+    },
 })  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from ccd_casadi.extensions.limitations.bound import (
     support_of,
     upper_bound,
 )
+from ccd_casadi.extensions.limitations.command import main
 from ccd_casadi.extensions.limitations.limits import (
     Limits,
     circle,
@@ -40,7 +41,6 @@ from ccd_casadi.extensions.limitations.of_problem import (
 )
 from ccd_casadi.fixed_structure import Bounds, Sampling
 from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.gap import main
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace

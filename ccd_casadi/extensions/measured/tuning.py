@@ -13,24 +13,24 @@ import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.deployment.realisation import realised
-from ccd_casadi.fixed_structure import judgement
-from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.judgement import Judgement
-from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
-from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
-from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.sections import HALF_POWER
-from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_flanks, zoomed
-from ccd_casadi.lti.loop import Sampling, tustin
-from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
-from ccd_casadi.studies.tuned_plants import (
+from ccd_casadi.extensions.measured.measured_design import NEGATIVE, MeasuredDesign, design_on_data
+from ccd_casadi.extensions.measured.measured_loop import bandwidth_within
+from ccd_casadi.extensions.measured.tuned_plants import (
     LineOptions,
     Plant,
     as_lines,
     read_plant,
     with_lines_near,
 )
+from ccd_casadi.fixed_structure import judgement
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.judgement import Judgement
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.kernels.sections import HALF_POWER
+from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_flanks, zoomed
+from ccd_casadi.lti.loop import Sampling, tustin
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent

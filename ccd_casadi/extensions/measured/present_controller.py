@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.deployment.given_controller import read_controller
+from ccd_casadi.extensions.measured.measured_loop import judge
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.measured_loop import judge
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError

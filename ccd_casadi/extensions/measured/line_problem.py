@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ccd_casadi.extensions.measured.measured_loop import winding
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
@@ -24,7 +25,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     RowPlaces,
 )
-from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.plant_set import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes

@@ -8,9 +8,9 @@ from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.inner_answer import InnerAnswer
 from ccd_casadi.codesign.result_entries import sections_controller
+from ccd_casadi.extensions.measured.measured_design import MeasuredDesign, design_on_data
+from ccd_casadi.extensions.measured.measured_loop import controller_response
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
-from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.lti.state_space import equivalent_open_loop
 from ccd_casadi.support.terminal import Tell, silent
@@ -82,6 +82,7 @@ def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
     }
     sampling = None if case.period is None else Sampling(1 / case.period)
     controller = sections_controller(design, sampling)
+    controller["sections"]["sign"] = design.sign
     return InnerAnswer("verified" if design.usable else "not_verified", figures, controller)
 
 

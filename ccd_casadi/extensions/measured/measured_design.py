@@ -17,13 +17,13 @@ from typing import cast
 
 import numpy as np
 
+from ccd_casadi.extensions.measured.line_problem import LineProblem, line_problem
+from ccd_casadi.extensions.measured.measured_loop import MeasuredFigures, judge
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, Decoupling
 from ccd_casadi.fixed_structure.design import DesignOptions, in_problem_units
-from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
-from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge
 from ccd_casadi.fixed_structure.multi_start import finished, run_race
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure

@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.between_lines import between, gap_of, hidden_damping
+from ccd_casadi.extensions.measured.between_lines import between, gap_of, hidden_damping
 from ccd_casadi.fixed_structure.bounds import Bounds, LoopPeaks, ShapeEnd
 from ccd_casadi.kernels.sections import HALF_POWER
 from ccd_casadi.lti.loop import tustin
