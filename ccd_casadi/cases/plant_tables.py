@@ -13,6 +13,7 @@ from ccd_casadi.cases.tables import Parameter, PlantTable
 from ccd_casadi.plants.registry import model_named, model_names
 from ccd_casadi.support import extensions
 
+MEASURED = "measured"  # the model of `measured_case`, which has no θ
 # Checks of a model's options that its builder's annotations do not say, by their names.
 _OPTIONS: dict[str, Check] = {
     "zeta": checks.FRACTION,

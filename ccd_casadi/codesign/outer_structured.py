@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
@@ -53,6 +52,9 @@ from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 from ccd_casadi.support.worker_process import alongside
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ class StructuredOuter(ThetaOuter):
         certificate = partial(theta_kkt, problem, best, sampler, end.inner.envelope, beside)
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
-        def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
+        def judged() -> "tuple[SetCertificate, int, Proof, Yield | None]":
             whole = on_box.judged(worst, sampler.workers)
             drawn = None if whole[-1].conclusive else on_box.fresh_yield(sampler.workers)
             return *whole, drawn

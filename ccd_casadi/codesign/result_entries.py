@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import BINDS, Place, key_words, kind_and_channel
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Structure
@@ -31,6 +30,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
@@ -331,7 +333,7 @@ def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, A
     }
 
 
-def proof_dict(proof: Proof) -> dict[str, Any]:
+def proof_dict(proof: "Proof") -> dict[str, Any]:
     """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
     found: dict[str, Any] = {
         "outcome": proof.outcome.name.lower(),
@@ -386,7 +388,7 @@ def sections_controller(design: WithSections, sampling: Sampling | None) -> dict
 
 
 def box_words(
-    wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
+    wide: SetCertificate, checked: int, proof: "Proof", worst: Excess, drawn: Yield | None,
     *, along: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Arguments of `survives` for a loop on its box of plants.

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
@@ -20,7 +20,6 @@ from ccd_casadi.codesign.result_entries import (
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
@@ -40,6 +39,9 @@ from ccd_casadi.sampling.units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import HZ, counted, told_apart
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class VerifiedStructured(Verified):
     multistart: StructuredValue | None
     wide: SetCertificate
     checked: int
-    proof: Proof
+    proof: "Proof"
     drawn: Yield | None
     worst: Excess
     rounds: int
