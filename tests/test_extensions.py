@@ -65,6 +65,11 @@ def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: P
         done = run_without(tmp_path, name, words=solve_words(tmp_path, "--scheduler", "tcp://a:1"))
         expected = "--scheduler needs the extension cluster, which is not installed\n"
         assert (done.returncode, done.stderr) == (2, expected)
+    if name == "formats":
+        words = ["-m", "ccd_casadi.deploy", str(tmp_path), "--fmu"]
+        done = run_without(tmp_path, name, words=words)
+        expected = "--fmu needs the extension formats, which is not installed\n"
+        assert (done.returncode, done.stderr) == (2, expected)
     done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "foo"])
     assert done.returncode == 2
     assert all(f" {word}," not in done.stderr for word in shipped()[name].commands)

@@ -29,9 +29,9 @@ SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
         "sampled_matrices": "imported",
     },
     "functions": {
-        "cluster": "cluster", "known_gap": "limitations", "measured_answer": "measured",
-        "measured_page": "measured",
-        "none_reaches": "limitations",
+        "cluster": "cluster", "fmu": "formats", "known_gap": "limitations",
+        "measured_answer": "measured", "measured_page": "measured",
+        "none_reaches": "limitations", "structured_text": "formats",
     },
 })  # fmt: skip
 
