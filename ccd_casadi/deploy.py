@@ -145,7 +145,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.timing_words import needed_words
-    from ccd_casadi.reporting.run_verdict import advice
+    from ccd_casadi.reporting.decision import advice
     from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(

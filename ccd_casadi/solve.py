@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import (
         channel_words,
         cost_words,
@@ -31,7 +32,7 @@ def summary(solution: "Solution") -> str:
         requirement_lines,
         theta_words,
     )
-    from ccd_casadi.reporting.run_verdict import advice, terminal_lines
+    from ccd_casadi.reporting.run_verdict import terminal_lines
     from ccd_casadi.support.text import template
 
     r = solution.result

@@ -458,6 +458,8 @@ class Head:
     verdict : tuple of VerdictRow
     decision : str
         What to do next, in a sentence or two.
+    own_decision : bool
+        Whether it answers another question than whether to build the run's design.
     """
 
     title: str
@@ -468,6 +470,7 @@ class Head:
     lead: str
     verdict: tuple[VerdictRow, ...] = ()
     decision: str = ""
+    own_decision: bool = False
 
 
 Text = Words | Heading | Bullets | Links | Source | Facts | Verdict

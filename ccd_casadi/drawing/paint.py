@@ -4,7 +4,7 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -253,20 +253,57 @@ def write_page(path: Path, page: Page, workers: Pool | None = None) -> None:
     except UserError:  # what cannot be read is written anew
         pages = {}
     pages[path.name] = plain(page, listed=True)
-    content = {"format": FORMAT, "pages": pages}
-    write_whole(path.with_name(NAME), json.dumps(content, ensure_ascii=False, allow_nan=False))
+    _write_content(path.with_name(NAME), pages)
     draw(path, pages[path.name], workers)
 
 
 def draw(path: Path, stored: Any, workers: Pool | None = None) -> None:
     """Draw a page from an entry of report.json, whose chapters may be called sections. Raises
     UserError where it is none."""
+    write_whole(path, page_html(_restored(path, stored), workers))
+
+
+def update_pages(folder: Path, change: Callable[[str, Page], Page]) -> dict[Path, str]:
+    """Draw those pages of a folder again whose head a change alters.
+
+    Parameters
+    ----------
+    folder : Path
+        With a report.json; without one, or with a damaged one, nothing is drawn.
+    change : callable
+        (name, Page) -> Page.
+
+    Returns
+    -------
+    dict of Path to str
+        Title of each page.
+    """
     try:
-        page = restored(Page, {"chapters": stored.get("sections"), **stored})
+        stored = read_pages(folder)
+        pages = {name: _restored(folder / name, entry) for name, entry in stored.items()}
+    except UserError:
+        return {}
+    changed = {name: change(name, page) for name, page in pages.items()}
+    anew = [name for name, page in changed.items() if page.head != pages[name].head]
+    if anew:
+        stored |= {name: plain(changed[name], listed=True) for name in anew}
+        _write_content(folder / NAME, stored)
+    for name in anew:
+        write_whole(folder / name, page_html(changed[name]))
+    return {folder / name: page.head.title for name, page in changed.items()}
+
+
+def _restored(path: Path, stored: Any) -> Page:
+    try:
+        return restored(Page, {"chapters": stored.get("sections"), **stored})
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None
-    write_whole(path, page_html(page, workers))
+
+
+def _write_content(path: Path, pages: Mapping[str, Any]) -> None:
+    content = {"format": FORMAT, "pages": pages}
+    write_whole(path, json.dumps(content, ensure_ascii=False, allow_nan=False))
 
 
 def read_pages(folder: Path) -> dict[str, Any]:

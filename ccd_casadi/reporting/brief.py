@@ -24,12 +24,12 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.reporting.decision import loop_concerns
+from ccd_casadi.reporting.concerns import loop_concerns
+from ccd_casadi.reporting.decision import Build, decide, lines_of, unproven
 from ccd_casadi.reporting.facts import binding, cost_words, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.reporting.run_verdict import advice, lines_of, unproven
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
 from surrogates.files import write_whole
@@ -123,9 +123,10 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
     str
     """
     result, problem = run.result, run.problem
-    decision = advice(result) or "Not judged."
-    colour = "good" if decision == "Build this." else "warn"
-    colour = "bad" if decision.startswith("Do not") else colour
+    decided = decide(result)
+    decision = decided.words or "Not judged."
+    clear = decided.build is Build.YES and not decided.condition
+    colour = "bad" if decided.refuses else "good" if clear else "warn"
     view = run_view(run)
     panel = panel_html(S_panel(view), 2, options.height, "S", "|S| of the loop")
     names = ("the model", "the others") if view.scalar else ("an eigenvalue of L", "the others")

@@ -1,185 +1,342 @@
-"""What a decision adds to the five lines: usual limits, the move at its force limit, what must be
-known."""
+"""Whether to build a design: a decision as a value, derived from result.json and never stored.
+
+A decision has a state (`Build`), findings with enumerated reasons, and what to do next. Its words
+are rendered from these and never read back. It rests on the five lines of the verdict and on
+`concerns`.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.analysis.loop_figures import LoopFigureOptions
-from ccd_casadi.codesign.verdict import State
-from ccd_casadi.support.text import inwards, spoken, with_unit
-
-USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
-    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
-    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
-    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
+from ccd_casadi.drawing.content import VerdictRow
+from ccd_casadi.reporting.concerns import (
+    current_concern,
+    limited_move,
+    limited_move_remedy,
+    line_concern,
+    loop_concerns,
+    resonance_condition,
 )
 
-
-@dataclass(frozen=True)
-class ConcernOptions:
-    """Usual limits of a loop beside those of `USUAL`.
-
-    Attributes
-    ----------
-    slack : float
-        Relative: a design lies on its bounds, and 2 is the usual S_max.
-    overshoot : float
-        Of a step without feedforward.
-    between_lines : float
-        What |S| may reach between the lines of a response, over the largest on them.
-    """
-
-    slack: float = 0.01
-    overshoot: float = 0.5
-    between_lines: float = 1.1
+LINES = ("certified", "optimal", "predicted", "survives", "deployable")
+NEXT = {  # what to do about a line that failed, or about what the decision names
+    "certified": "solve the case again",
+    "optimal": "more starts or box_points in [outer]",
+    "predicted": "retrain, or more points in [sampling]",
+    "survives": "a [robust] set in the case",
+    "wider": "a wider resonance_shift or damping in [robust]",
+    "deployable": "a higher rate or less delay",
+    "unproven": "a smaller [robust] set, or fewer parameters in it",
+    "budget": "solve again with a larger --budget, which goes on from what is stored",
+    "current": "a larger peak_current, or less jerk or acceleration in [move]",
+    "loop": "a smaller S_max; with sections bandwidth_least_hz, least_damping or weighted_level",
+}
 
 
-@dataclass(frozen=True)
-class ConditionOptions:
-    """Numbers of the conditions.
+class Build(StrEnum):
+    """What a decision says: every decision has one of these states.
 
     Attributes
     ----------
-    identified : float
-        Relative: how well resonances are known where nothing else is stated.
+    YES, AFTER_DEPLOY
+        Every line passed; hold and delay are not judged yet.
+    IF_ACCEPTED
+        The findings are for the reader to weigh.
+    NOT_YET, NO
+        What it survives is not known, or a move does not settle; a line failed.
+    LOOK, NOT_VERIFIED, NOTHING
+        Of a loop without a verdict, as `tune` makes it: concerns, no certificate, nothing to say.
     """
 
-    identified: float = 0.05
+    YES = "yes"
+    AFTER_DEPLOY = "after_deploy"
+    IF_ACCEPTED = "if_accepted"
+    NOT_YET = "not_yet"
+    NO = "no"
+    LOOK = "look"
+    NOT_VERIFIED = "not_verified"
+    NOTHING = "nothing"
 
 
-def limited_move(result: Mapping[str, Any]) -> str:
-    """Why the simulated move of `deploy --saturation` speaks against the design.
+SENTENCES = {
+    Build.YES: "Build this.",
+    Build.AFTER_DEPLOY: "Build this after deploy: hold and delay are not judged yet.",
+    Build.IF_ACCEPTED: "Build this only if you accept: {}.",
+    Build.NOT_YET: "Do not build this yet: {}.",
+    Build.NO: "Do not build this: {}.",
+    Build.LOOK: "Look at the loop before you run it: {}.",
+    Build.NOT_VERIFIED: "Do not run this: it is not verified.",
+    Build.NOTHING: "",
+}
+
+
+class Reason(StrEnum):
+    """Why a decision is not an unconditional yes."""
+
+    LINE_FAILED = "line_failed"
+    LINE_WARNED = "line_warned"
+    LINE_UNKNOWN = "line_unknown"
+    NOT_VERIFIED = "not_verified"
+    MODEL_ALONE = "model_alone"
+    SMALL_ERRORS = "small_errors"
+    SURVIVAL_UNKNOWN = "survival_unknown"
+    SET_UNPROVEN = "set_unproven"
+    SET_SEARCHED = "set_searched"
+    UNSTABLE_CONTROLLER = "unstable_controller"
+    MOVE = "move"
+    CURRENT = "current"
+    LOOP = "loop"
+    BUDGET = "budget"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A reason, in words for this design."""
+
+    reason: Reason
+    words: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether to build a design.
+
+    Attributes
+    ----------
+    build : Build
+    findings : tuple of Finding
+        The first is the most important.
+    steps : tuple of str
+        What to do next.
+    beside : tuple of Finding
+        What else speaks against a design that must not be built.
+    unjudged : bool
+        Hold and delay are not judged yet.
+    condition : str
+        What must be known of the resonances, in a sentence; empty where nothing must.
+    """
+
+    build: Build
+    findings: tuple[Finding, ...] = ()
+    steps: tuple[str, ...] = ()
+    beside: tuple[Finding, ...] = ()
+    unjudged: bool = False
+    condition: str = ""
+
+    @property
+    def words(self) -> str:
+        """The decision in a sentence or two, for terminal and pages."""
+        parts = [SENTENCES[self.build].format("; ".join(one.words for one in self.findings))]
+        parts += [f"Besides, {one.words}." for one in self.beside]
+        parts += [f"Next: {'; '.join(self.steps)}."] if self.steps else []
+        if self.unjudged and self.build is Build.IF_ACCEPTED:
+            parts.append("Deploy it first: hold and delay are not judged yet.")
+        return " ".join(part for part in (*parts, self.condition) if part)
+
+    @property
+    def builds(self) -> bool:
+        """Whether the design may be built, if under conditions."""
+        return self.build in (Build.YES, Build.AFTER_DEPLOY, Build.IF_ACCEPTED)
+
+    @property
+    def refuses(self) -> bool:
+        """Whether the design must not be built, or not yet."""
+        return self.build in (Build.NO, Build.NOT_YET, Build.NOT_VERIFIED)
+
+
+def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
+    """Read the lines of the verdict of result.json.
 
     Parameters
     ----------
     result : mapping
-        Of result.json.
 
     Returns
     -------
-    str
-        Words; empty where the move settles, and where no limit was given.
+    tuple of VerdictRow
+        Empty for a run without a design, or older than verdicts.
     """
-    move = _move(result)
-    limit = spoken(f"{move.get('force_limit', 0.0):.4g} N")
-    if move.get("state") == State.UNKNOWN:
-        return f"whether the move settles within a limit of {limit} is not known"
-    if move.get("state") != State.FAILED:
-        return ""
-    left = with_unit(move["left"], spoken("m"))
-    words = f"limited to {limit} the move has not settled after {with_unit(move['time'], 's')}"
-    return f"{words} ({left} left)"
+    verdict = result.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return ()
+    found = []
+    for name in LINES:
+        line = verdict.get(name)
+        if isinstance(line, Mapping) and line.get("state") in set(State):
+            found.append(VerdictRow(name, str(line["state"]), str(line.get("words", ""))))
+    return tuple(found)
 
 
-def limited_move_remedy(result: Mapping[str, Any]) -> str:
-    """What to change where `limited_move` has words.
+def worst_state(result: Mapping[str, Any]) -> State:
+    """Find the worst state of a verdict: failed, then warned, then passed.
 
     Parameters
     ----------
     result : mapping
-        Of result.json.
+        Of result.json; an unknown line counts as none of them.
 
     Returns
     -------
-    str
-        A step.
+    State
     """
-    if _move(result).get("settles_unlimited", True):
-        return "deploy with a larger --saturation, or a slower move"
-    return "deploy with a slower move or a wider --window: it does not settle unlimited either"
+    states = {line.state for line in lines_of(result)}
+    return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
 
 
-def _move(result: Mapping[str, Any]) -> Mapping[str, Any]:
-    return (result.get("verdict", {}).get("deployable") or {}).get("move") or {}
+def unproven(result: Mapping[str, Any]) -> str | None:
+    """Why `survives` is neither passed nor warned; None where it is one of them."""
+    line = next((line for line in lines_of(result) if line.name == "survives"), None)
+    if line is None or line.state != State.UNKNOWN:
+        return None
+    own = result["verdict"]["survives"].get("set")
+    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
 
 
-def resonance_condition(
-    result: Mapping[str, Any], *, options: ConditionOptions = ConditionOptions()
-) -> str:
-    """How well the resonances have to be known, where no set of the case holds such an error.
+def decide(result: Mapping[str, Any]) -> Decision:
+    """Decide whether to build a design, and what comes next.
 
     Parameters
     ----------
     result : mapping
-        Of result.json.
-    options : ConditionOptions
+        Of result.json. Without a verdict only concerns about the loop count.
 
     Returns
     -------
-    str
-        A sentence; empty where the loop has room, or the case names an error that it holds.
+    Decision
     """
-    line = result.get("verdict", {}).get("survives", {})
-    kept, held = line.get("S_max_shift"), line.get("set_shift")
-    if kept is None or held is None:  # of an older run it is not known what its set holds
-        return ""
-    near = [
-        abs(end) < options.identified and own == 0.0 for end, own in zip(kept, held, strict=True)
+    states = {line.name: line.state for line in lines_of(result)}
+    if not states:
+        return _decide_loop(result)
+    failed = [name for name, state in states.items() if state == State.FAILED]
+    move = limited_move(result)
+    beside = (Finding(Reason.MOVE, move),) if move else ()
+    if failed or result.get("status") != "verified":
+        why = Finding(Reason.NOT_VERIFIED, "it is not verified")
+        if failed:
+            why = Finding(Reason.LINE_FAILED, f"{' and '.join(failed)} failed")
+        step = _next_of_failed(failed[0], result) if failed else "see why"
+        return Decision(Build.NO, (why,), (step,), beside)
+    if states.get("certified") == State.UNKNOWN:
+        why = Finding(Reason.LINE_UNKNOWN, "whether it is certified is not known")
+        return Decision(Build.NOT_YET, (why,), (NEXT["certified"],), beside)
+    survival = _survival_findings(result, states.get("survives"))
+    against = {Reason.SMALL_ERRORS: Build.NO, Reason.MODEL_ALONE: Build.NOT_YET,
+               Reason.SURVIVAL_UNKNOWN: Build.NOT_YET}  # fmt: skip
+    for finding in survival:
+        if finding.reason in against:
+            kept = result["verdict"]["survives"].get("set") == OwnSet.KEPT
+            step = NEXT["wider" if kept else "survives"]
+            return Decision(against[finding.reason], (finding,), (step,), beside)
+    if move:
+        return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
+    warned = [
+        Finding(Reason.LINE_WARNED, f"{name} warned")
+        for name, state in states.items()
+        if state == State.WARNED and name != "survives"
     ]
-    low, high = (inwards(100.0 * end, 2, 3) for end in kept)
-    if all(near):
-        where = f"resonances lie within {low:+g} to {high:+g} % of their model"
-    elif near[0]:
-        where = f"no resonance is {f'more than {-low:g} % ' if low else ''}below its model"
-    elif near[1]:
-        where = f"no resonance is {f'more than {high:g} % ' if high else ''}above its model"
-    else:
-        return ""
-    return f"Condition: {where}; else |S| exceeds S_max."
+    searched = [one for one in survival if one.reason is Reason.SET_SEARCHED]
+    weighed = [one for one in survival if one.reason is not Reason.SET_SEARCHED]
+    findings = [*weighed, *warned, *searched]
+    budget = result.get("time_budget", {})
+    if budget.get("ended"):
+        words = f"the search was ended by its budget of {budget['minutes']:g} min"
+        findings.append(Finding(Reason.BUDGET, words))
+    elif states.get("optimal") == State.UNKNOWN:
+        words = "whether it is an optimum is not known"
+        findings.append(Finding(Reason.LINE_UNKNOWN, words))
+    findings += _loop_findings(result)
+    unjudged = states.get("deployable") == State.UNKNOWN
+    condition = resonance_condition(result)
+    if not findings:
+        build = Build.AFTER_DEPLOY if unjudged else Build.YES
+        return Decision(build, unjudged=unjudged, condition=condition)
+    remedies = {Reason.SET_UNPROVEN: "unproven", Reason.CURRENT: "current",
+                Reason.LOOP: "loop", Reason.BUDGET: "budget"}  # fmt: skip
+    present = {one.reason for one in findings}
+    steps = tuple(NEXT[name] for reason, name in remedies.items() if reason in present)
+    return Decision(Build.IF_ACCEPTED, tuple(findings), steps, (), unjudged, condition)
 
 
-def loop_concerns(
-    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
-    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
-    and what is narrow or rings near the bandwidth, against the usual limits of the field.
-
-    The step does not count where the case names the move that the stage makes.
-    """
-    found = [
-        words.format(result[key])
-        for key, least, words in USUAL
-        if result.get(key) is not None and result[key] < (1.0 - options.slack) * least
-    ]
-    if "step_overshoot" in result and "move" not in result:
-        overshoot = result["step_overshoot"]
-        if overshoot > options.overshoot:
-            usual = f"usual: at most {100.0 * options.overshoot:g}"
-            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
-        settled, followed = result["settling_ms"], LoopFigureOptions().periods
-        if settled is None:
-            found.append("a step does not settle within 2 %")
-        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
-            late = f"only after {with_unit(1e-3 * settled, 's')}"
-            found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
-    reach = result.get("sensitivity_peak_between_lines")  # of a measured response
-    if reach is not None and reach > max(1.0, options.between_lines * result["sensitivity_peak"]):
-        where = result.get("sensitivity_peak_between_lines_hz")
-        at = "" if where is None else f" about {where:.4g} Hz"
-        found.append(f"|S| may reach {reach:.3g} between two lines{at}")
-    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
-
-
-def current_concern(
-    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
-    """What a move needs beyond the peak current of its motor; empty where it is enough.
+def advice(result: Mapping[str, Any]) -> str:
+    """Write the decision on a design (`decide`) in words.
 
     Parameters
     ----------
     result : mapping
         Of result.json.
-    options : ConcernOptions
 
     Returns
     -------
-    list of str
+    str
+        Empty where there is nothing to decide.
     """
-    move = result.get("move") or {}
-    share = move.get("needed_share")
-    if share is None or not share > 1.0 + options.slack:
-        return []
-    most = move["needed_current"] / share
-    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
-    return [f"{words}, and peak_current is {most:.4g} A"]
+    return decide(result).words
+
+
+def _decide_loop(result: Mapping[str, Any]) -> Decision:
+    """Of a loop without a verdict: `tune` and baselines."""
+    if result.get("status", "verified") != "verified":
+        return Decision(Build.NOT_VERIFIED, steps=("see why",))
+    findings = _loop_findings(result)
+    if not findings:
+        return Decision(Build.NOTHING)
+    step = "a smaller S_max"
+    if [one.words for one in findings] == line_concern(result):
+        step = "more lines there, or more averages"
+    if all(one.reason is Reason.CURRENT for one in findings):
+        step = NEXT["current"]
+    return Decision(Build.LOOK, findings, (step,))
+
+
+def _loop_findings(result: Mapping[str, Any]) -> tuple[Finding, ...]:
+    current = current_concern(result)
+    return tuple(
+        Finding(Reason.CURRENT if words in current else Reason.LOOP, words)
+        for words in loop_concerns(result)
+    )
+
+
+def _survival_findings(result: Mapping[str, Any], state: str | None) -> list[Finding]:
+    """What the line `survives` adds; nothing where it passed."""
+    own = result["verdict"].get("survives", {}).get("set")
+    if state == State.WARNED:
+        if own == OwnSet.UNPROVEN:
+            words = "the bounds are not proven on the whole [robust] set"
+            return [Finding(Reason.SET_UNPROVEN, words)]
+        if own == OwnSet.KEPT and (doubt := _unstable_controller(result)):
+            return [Finding(Reason.UNSTABLE_CONTROLLER, doubt)]
+        if own == OwnSet.NONE:
+            return [Finding(Reason.MODEL_ALONE, "it was judged on the model alone")]
+        return [Finding(Reason.SMALL_ERRORS, "it does not survive small errors of its model")]
+    if state == State.UNKNOWN:
+        if own == OwnSet.SEARCHED:
+            return [Finding(Reason.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
+        return [Finding(Reason.SURVIVAL_UNKNOWN, "what it survives is not known")]
+    return []
+
+
+def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
+    """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
+    line = result["verdict"][name]
+    rate_helps = line.get("needed_hz", 0.0) is not None
+    return NEXT[name] if name != "deployable" or rate_helps else "less delay"
+
+
+def _unstable_controller(result: Mapping[str, Any]) -> str:
+    """Why `survives` warns of a loop that keeps its [robust] set and small errors beyond it; empty
+    where it does not survive the latter."""
+    line = result["verdict"]["survives"]
+    shift, least = line.get("stable_shift"), line.get("least_shift", 0.0)
+    if shift is None or not (shift[0] <= -least and shift[1] >= least):
+        return ""
+    damping, least_factors = line.get("stable_damping"), VerdictOptions().least_factors
+    if line.get("closer_models") or damping is None:
+        return ""
+    if not (damping[0] <= least_factors[0] and damping[1] >= least_factors[1]):
+        return ""
+    poles = line.get("unstable_controller_poles_hz") or []
+    at = ", ".join(f"{hz:.4g}" for hz in poles[:3])
+    return f"the controller is unstable by itself (poles at {at} Hz)" if poles else ""

@@ -1,94 +1,25 @@
 """The verdict of a run as every command and page shows it, and the index of a run's folder."""
 
 import json
-import re
 import sys
 from collections.abc import Mapping
-from html import unescape
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
-from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictRow
-from ccd_casadi.drawing.paint import block_html, page_html, write_page
-from ccd_casadi.reporting.decision import (
-    current_concern,
-    limited_move,
-    limited_move_remedy,
-    loop_concerns,
-    resonance_condition,
-)
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page
+from ccd_casadi.drawing.paint import page_html, update_pages, write_page
+from ccd_casadi.reporting.concerns import loop_concerns
+from ccd_casadi.reporting.decision import advice, lines_of, unproven, worst_state
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped
 from surrogates.files import write_whole
 
-LINES = ("certified", "optimal", "predicted", "survives", "deployable")
-NEXT = {  # what to do about a line that failed, or about what the decision names
-    "certified": "solve the case again",
-    "optimal": "more starts or box_points in [outer]",
-    "predicted": "retrain, or more points in [sampling]",
-    "survives": "a [robust] set in the case",
-    "wider": "a wider resonance_shift or damping in [robust]",
-    "deployable": "a higher rate or less delay",
-    "unproven": "a smaller [robust] set, or fewer parameters in it",
-    "budget": "solve again with a larger --budget, which goes on from what is stored",
-    "current": "a larger peak_current, or less jerk or acceleration in [move]",
-    "loop": "a smaller S_max; with sections bandwidth_least_hz, least_damping or weighted_level",
-}
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
-BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
-DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
-TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
-
-
-def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
-    """Read the lines of the verdict of result.json.
-
-    Parameters
-    ----------
-    result : mapping
-
-    Returns
-    -------
-    tuple of VerdictRow
-        Empty for a run without a design, or older than verdicts.
-    """
-    verdict = result.get("verdict")
-    if not isinstance(verdict, Mapping):
-        return ()
-    found = []
-    for name in LINES:
-        line = verdict.get(name)
-        if isinstance(line, Mapping) and line.get("state") in set(State):
-            found.append(VerdictRow(name, str(line["state"]), str(line.get("words", ""))))
-    return tuple(found)
-
-
-def worst_state(result: Mapping[str, Any]) -> State:
-    """Find the worst state of a verdict: failed, then warned, then passed.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json; an unknown line counts as none of them.
-
-    Returns
-    -------
-    State
-    """
-    states = {line.state for line in lines_of(result)}
-    return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
-
-
-def unproven(result: Mapping[str, Any]) -> str | None:
-    """Why `survives` is neither passed nor warned; None where it is one of them."""
-    line = next((line for line in lines_of(result) if line.name == "survives"), None)
-    if line is None or line.state != State.UNKNOWN:
-        return None
-    own = result["verdict"]["survives"].get("set")
-    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
 
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
@@ -118,123 +49,21 @@ def head_of(
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
     clean &= unproven(result) is None
     badge = "bad" if not good else "good" if clean else "warn"
+    own = bool(decision)
     decision = decision or advice(result)
-    return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
+    return Head(title, badge, status, reason, meta, lead, lines_of(result), decision, own)
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
-    failed = [line for line in lines_of(result) if line.state == State.FAILED]
-    below = "; ".join(f"{line.name}: {line.words}" for line in failed)
-    why = str(result.get("reason") or "").replace(f" ({below})", "")
+    failed = [name for name, held in result.get("checks", {}).items() if held is False]
+    failed = failed or [line.name for line in lines_of(result) if line.state == State.FAILED]
+    why = f"failed: {', '.join(failed)}" if failed else str(result.get("reason") or "")
     reason = head_words(result) if good else why
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
     status = STATUS.get(result["status"], "not verified")
     return head_of(title, good, status, reason, meta, lead, result)
-
-
-def with_verdict_of(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
-    """A page with the decision and the verdict as they are now; of the run's own (`whole`) the
-    badge too."""
-    source = block_html(run_head("", result, "", ""))
-    for place in (DECISION, TABLE, *([BADGE] if whole else [])):
-        old, new = place.search(text), place.search(source)
-        if old is not None and new is not None:
-            text = text[: old.start()] + new[0] + text[old.end() :]
-    return text
-
-
-def advice(result: Mapping[str, Any]) -> str:
-    """Write the decision: build this or not, and what comes next.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json. Without a verdict only concerns about the loop are written.
-
-    Returns
-    -------
-    str
-    """
-    states = {line.name: line.state for line in lines_of(result)}
-    failed = [name for name, state in states.items() if state == State.FAILED]
-    looked_at = loop_concerns(result)
-    if not states:
-        if result.get("status", "verified") != "verified":
-            return "Do not run this: it is not verified. Next: see why."
-        words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
-        lines = all("between two lines" in concern for concern in looked_at)
-        after = "more lines there, or more averages" if lines else "a smaller S_max"
-        after = NEXT["current"] if looked_at == current_concern(result) else after
-        return f"{words} Next: {after}." if looked_at else ""
-    stuck = limited_move(result)
-    also = f" Besides, {stuck}." if stuck else ""
-    if failed or result.get("status") != "verified":
-        why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
-        step = _next_of_failed(failed[0], result) if failed else "see why"
-        return f"Do not build this: {why}.{also} Next: {step}."
-    own = result["verdict"].get("survives", {}).get("set")
-    unclosed = states.get("survives") == State.WARNED and own == OwnSet.UNPROVEN
-    doubts = _doubts_of_kept_set(result) if own == OwnSet.KEPT else []
-    if states.get("survives") == State.WARNED and not unclosed and not doubts:
-        words = "Do not build this: it does not survive small errors of its model."
-        if own == OwnSet.NONE:
-            words = "Do not build this yet: it was judged on the model alone."
-        return f"{words}{also} Next: {NEXT['wider' if own == OwnSet.KEPT else 'survives']}."
-    warned = ["the bounds are not proven on the whole [robust] set"] if unclosed else doubts
-    warned += [
-        f"{name} warned"
-        for name, state in states.items()
-        if state == State.WARNED and name != "survives"
-    ]
-    if states.get("survives") == State.UNKNOWN:
-        if unproven(result) == "not known":
-            words = "Do not build this yet: what it survives is not known."
-            return f"{words}{also} Next: {NEXT['survives']}."
-        warned.append(f"the [robust] set is {unproven(result)}")
-    if stuck:
-        return f"Do not build this yet: {stuck}. Next: {limited_move_remedy(result)}."
-    condition = resonance_condition(result)
-    condition = condition and f" {condition}"
-    budget = result.get("time_budget", {})
-    if ended := bool(budget.get("ended")):
-        warned.append(f"the search was ended by its budget of {budget['minutes']:g} min")
-    unjudged = states.get("deployable") == State.UNKNOWN
-    if warned or looked_at:
-        words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
-        of_motor = current_concern(result)
-        steps = [NEXT["unproven"]] * unclosed + [NEXT["current"]] * len(of_motor)
-        steps += [NEXT["loop"]] * (len(looked_at) > len(of_motor))
-        steps += [NEXT["budget"]] * ended
-        after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
-        return words + (f" Next: {'; '.join(steps)}." if steps else "") + after + condition
-    later = " after deploy: hold and delay are not judged yet" if unjudged else ""
-    return f"Build this{later}.{condition}"
-
-
-def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
-    """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
-    line = result["verdict"][name]
-    rate_helps = line.get("needed_hz", 0.0) is not None
-    return NEXT[name] if name != "deployable" or rate_helps else "less delay"
-
-
-def _doubts_of_kept_set(result: Mapping[str, Any]) -> list[str]:
-    """Why `survives` warns of a loop that keeps its [robust] set and small errors beyond it; empty
-    where it does not survive the latter."""
-    line = result["verdict"]["survives"]
-    shift, least = line.get("stable_shift"), line.get("least_shift", 0.0)
-    if shift is None or not (shift[0] <= -least and shift[1] >= least):
-        return []
-    damping, least_factors = line.get("stable_damping"), VerdictOptions().least_factors
-    if line.get("closer_models") or damping is None:
-        return []
-    if not (damping[0] <= least_factors[0] and damping[1] >= least_factors[1]):
-        return []
-    poles = line.get("unstable_controller_poles_hz") or []
-    at = ", ".join(f"{hz:.4g}" for hz in poles[:3])
-    return [f"the controller is unstable by itself (poles at {at} Hz)"] if poles else []
 
 
 def head_words(result: Mapping[str, Any]) -> str:
@@ -332,14 +161,24 @@ def write_index(folder: Path) -> None:
         return
     if result["status"] != "infeasible" and "objective" not in result:  # `tune` has one page
         return
+    whole = run_head("", result, "", "")
+
+    def updated(own: bool, name: str, page: Page) -> Page:
+        head = page.head
+        if head.verdict:
+            head = replace(head, verdict=whole.verdict)
+        if head.decision and not head.own_decision:
+            head = replace(head, decision=whole.decision)
+        if own and name == "report.html":
+            head = replace(head, badge=whole.badge, status=whole.status, reason=whole.reason)
+        return replace(page, head=head)
+
     pages = _pages(folder)
-    for place in pages:
-        text = place.read_text(encoding="utf-8")
-        now = with_verdict_of(text, result, whole=place == folder / "report.html")
-        if now != text:
-            write_whole(place, now)
+    titles: dict[Path, str] = {}
+    for place in sorted({page.parent for page in pages}):
+        titles |= update_pages(place, partial(updated, place == folder))
     links = tuple(
-        (quote(place.relative_to(folder).as_posix()), _title(place), words)
+        (quote(place.relative_to(folder).as_posix()), titles.get(place, place.name), words)
         for place, words in pages.items()
     )
     files = tuple((n, n, words) for n, words in FILES.items() if (folder / n).exists())
@@ -357,8 +196,3 @@ def _pages(folder: Path) -> dict[Path, str]:
         for place in sorted(folder.glob(name))
         if place.parent == folder or not (place.parent / "result.json").exists()
     }
-
-
-def _title(place: Path) -> str:
-    found = re.search(r"<title>(.*?)</title>", place.read_text(encoding="utf-8"))
-    return unescape(found[1]) if found else place.name

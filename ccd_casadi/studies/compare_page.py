@@ -13,10 +13,10 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.decision import lines_of, worst_state
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
-from ccd_casadi.reporting.run_verdict import lines_of, worst_state
 from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.studies.comparison import LABELS, Comparison, Method, stable_words
 from ccd_casadi.studies.steepest_descent import baseline_of

@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.run_verdict import advice
+from ccd_casadi.reporting.decision import decide
 from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.store import SampleStore
@@ -88,10 +88,10 @@ def conclusions(
 
 def decision(figures: dict[str, Any]) -> str:
     """Whether to build a design: of a baseline, which has no other line, by what it survives."""
-    words = advice(figures)
-    if words and "certified" not in figures.get("verdict", {}) and words.startswith("Build"):
+    found = decide(figures)
+    if "certified" not in figures.get("verdict", {}) and found.builds:
         return "Solve the case before you build this: a baseline has no whole verdict."
-    return words
+    return found.words
 
 
 def stable_words(figures: dict[str, Any]) -> str:

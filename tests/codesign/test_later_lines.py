@@ -12,7 +12,7 @@ from ccd_casadi.codesign.result import with_verdict_line
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page
-from ccd_casadi.drawing.paint import page_html
+from ccd_casadi.drawing.paint import write_page
 from ccd_casadi.reporting.run_verdict import run_head, write_index
 from ccd_casadi.robustness import main as robustness
 
@@ -94,7 +94,7 @@ def test_words_from_anywhere_stay_words_and_a_study_kept_apart_changes_no_run(tm
     place = folder / "result.json"
     place.write_text(json.dumps(result))
     for name in ("report.html", "other/report.html"):
-        (folder / name).write_text(page_html(Page(run_head("t", result, "", ""), ())))
+        write_page(folder / name, Page(run_head("t", result, "", ""), ()))
     (folder / "other" / "result.json").write_text("{}")  # another run, below this one
     run, kept = run_in(folder, result), place.read_bytes()
     line = VerdictLine(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})

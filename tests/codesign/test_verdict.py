@@ -40,6 +40,7 @@ from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.reporting import decision
 from ccd_casadi.reporting import run_verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import local_peaks_with_gradients
@@ -362,7 +363,7 @@ def test_all_formulations_end_at_the_same_optimum_of_the_modal_table() -> None:
 
 
 def result_of(**states: str) -> dict:
-    lines = {name: {"state": "passed", "words": f"{name} words"} for name in shown.LINES}
+    lines = {name: {"state": "passed", "words": f"{name} words"} for name in decision.LINES}
     for name, state in states.items():
         lines[name]["state"] = state
     return {"verdict": lines, "checks": {"certificate": True}, "status": "verified"}
@@ -371,11 +372,11 @@ def result_of(**states: str) -> dict:
 def test_every_place_shows_the_same_lines() -> None:
     result = result_of(survives="warned", deployable="unknown")
     terminal = "\n".join(shown.terminal_lines(result))
-    page = block_html(Verdict(shown.lines_of(result)))
-    for name in shown.LINES:
+    page = block_html(Verdict(decision.lines_of(result)))
+    for name in decision.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
-    assert shown.worst_state(result) is v.State.WARNED
+    assert decision.worst_state(result) is v.State.WARNED
     assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)
@@ -384,5 +385,5 @@ def test_every_place_shows_the_same_lines() -> None:
 
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
-    assert shown.lines_of(damage) == ()
-    assert block_html(Verdict(shown.lines_of(damage))) == ""
+    assert decision.lines_of(damage) == ()
+    assert block_html(Verdict(decision.lines_of(damage))) == ""

@@ -41,8 +41,9 @@ def run(solved: Callable[[str], Path], tmp_path: Path) -> Path:
 
 def terminal_of(folder: Path) -> str:
     """What `solve` printed of a run, from its result."""
+    from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import loop_lines
-    from ccd_casadi.reporting.run_verdict import advice, terminal_lines
+    from ccd_casadi.reporting.run_verdict import terminal_lines
 
     r = json.loads((folder / "result.json").read_text())
     lines = [

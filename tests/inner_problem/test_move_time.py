@@ -31,8 +31,7 @@ from ccd_casadi.plants.plant import (
     hardware_slopes,
     mechanics,
 )
-from ccd_casadi.reporting.decision import current_concern
-from ccd_casadi.reporting.run_verdict import advice
+from ccd_casadi.reporting.decision import advice, current_concern
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches

@@ -37,8 +37,7 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.lti.loop import sampled, tustin
-from ccd_casadi.reporting.decision import ConditionOptions
-from ccd_casadi.reporting.run_verdict import advice
+from ccd_casadi.reporting.concerns import ConditionOptions, advice
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main

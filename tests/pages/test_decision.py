@@ -9,8 +9,8 @@ from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.reporting.brief import risks
-from ccd_casadi.reporting.decision import ConditionOptions, resonance_condition
-from ccd_casadi.reporting.run_verdict import advice
+from ccd_casadi.reporting.concerns import ConditionOptions, resonance_condition
+from ccd_casadi.reporting.decision import Build, Reason, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 
@@ -47,6 +47,45 @@ def test_a_move_that_does_not_settle_within_its_limit_is_in_every_decision(state
         assert "Next: " in words
         if before.startswith("Do not"):  # whose reason stays the first
             assert words.startswith(before.partition(".")[0])
+
+
+@given(
+    states=st.fixed_dictionaries(
+        {name: st.sampled_from(["passed", "warned", "failed", "unknown"]) for name in LINES}
+    ),
+    own=st.sampled_from([None, *OwnSet]),
+    ended=st.booleans(),
+    move=st.sampled_from(["none", "passed", "failed", "unknown"]),
+    verified=st.booleans(),
+)
+def test_no_decision_builds_what_failed_or_is_not_known(
+    states: dict, own: OwnSet | None, ended: bool, move: str, verified: bool
+) -> None:
+    result = result_of(**states)
+    result["status"] = "verified" if verified else "not_verified"
+    result["verdict"]["survives"]["set"] = own
+    if move != "none":
+        result["verdict"]["deployable"]["move"] = moved(move)
+    result["time_budget"] = {"ended": ended, "minutes": 5.0}
+    found = decide(result)
+    reasons = {one.reason for one in found.findings}
+    assert found.builds != found.refuses
+    if not verified or "failed" in states.values() or move in ("failed", "unknown"):
+        assert found.refuses
+    if found.build in (Build.YES, Build.AFTER_DEPLOY):
+        assert not reasons
+        assert not ended
+        judged = {name: state for name, state in states.items() if name != "deployable"}
+        # without a surrogate nothing was predicted
+        assert judged.pop("predicted") in ("passed", "unknown")
+        assert set(judged.values()) == {"passed"}
+    else:
+        assert found.findings
+    if found.builds:
+        assert (Reason.BUDGET in reasons) == ended
+    for one in found.findings:
+        assert one.words in found.words
+    assert found.words == advice(result)
 
 
 def test_a_larger_limit_is_no_remedy_where_the_move_does_not_settle_without_one() -> None:

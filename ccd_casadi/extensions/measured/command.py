@@ -47,8 +47,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.kinds import FixedStructure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.loop import tustin
+    from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import loop_lines
-    from ccd_casadi.reporting.run_verdict import advice
     from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.text import versions

@@ -1,0 +1,204 @@
+"""What speaks against a loop that meets the bounds of its case: usual limits, the move at its force
+limit, the motor's current, and what must be known of the resonances."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ccd_casadi.analysis.loop_figures import LoopFigureOptions
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.support.text import inwards, spoken, with_unit
+
+USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
+    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
+    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
+    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
+)
+
+
+@dataclass(frozen=True)
+class ConcernOptions:
+    """Usual limits of a loop beside those of `USUAL`.
+
+    Attributes
+    ----------
+    slack : float
+        Relative: a design lies on its bounds, and 2 is the usual S_max.
+    overshoot : float
+        Of a step without feedforward.
+    between_lines : float
+        What |S| may reach between the lines of a response, over the largest on them.
+    """
+
+    slack: float = 0.01
+    overshoot: float = 0.5
+    between_lines: float = 1.1
+
+
+@dataclass(frozen=True)
+class ConditionOptions:
+    """Numbers of the conditions.
+
+    Attributes
+    ----------
+    identified : float
+        Relative: how well resonances are known where nothing else is stated.
+    """
+
+    identified: float = 0.05
+
+
+def limited_move(result: Mapping[str, Any]) -> str:
+    """Why the simulated move of `deploy --saturation` speaks against the design.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    str
+        Words; empty where the move settles, and where no limit was given.
+    """
+    move = _move(result)
+    limit = spoken(f"{move.get('force_limit', 0.0):.4g} N")
+    if move.get("state") == State.UNKNOWN:
+        return f"whether the move settles within a limit of {limit} is not known"
+    if move.get("state") != State.FAILED:
+        return ""
+    left = with_unit(move["left"], spoken("m"))
+    words = f"limited to {limit} the move has not settled after {with_unit(move['time'], 's')}"
+    return f"{words} ({left} left)"
+
+
+def limited_move_remedy(result: Mapping[str, Any]) -> str:
+    """What to change where `limited_move` has words.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    str
+        A step.
+    """
+    if _move(result).get("settles_unlimited", True):
+        return "deploy with a larger --saturation, or a slower move"
+    return "deploy with a slower move or a wider --window: it does not settle unlimited either"
+
+
+def _move(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    return (result.get("verdict", {}).get("deployable") or {}).get("move") or {}
+
+
+def resonance_condition(
+    result: Mapping[str, Any], *, options: ConditionOptions = ConditionOptions()
+) -> str:
+    """How well the resonances have to be known, where no set of the case holds such an error.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConditionOptions
+
+    Returns
+    -------
+    str
+        A sentence; empty where the loop has room, or the case names an error that it holds.
+    """
+    line = result.get("verdict", {}).get("survives", {})
+    kept, held = line.get("S_max_shift"), line.get("set_shift")
+    if kept is None or held is None:  # of an older run it is not known what its set holds
+        return ""
+    near = [
+        abs(end) < options.identified and own == 0.0 for end, own in zip(kept, held, strict=True)
+    ]
+    low, high = (inwards(100.0 * end, 2, 3) for end in kept)
+    if all(near):
+        where = f"resonances lie within {low:+g} to {high:+g} % of their model"
+    elif near[0]:
+        where = f"no resonance is {f'more than {-low:g} % ' if low else ''}below its model"
+    elif near[1]:
+        where = f"no resonance is {f'more than {high:g} % ' if high else ''}above its model"
+    else:
+        return ""
+    return f"Condition: {where}; else |S| exceeds S_max."
+
+
+def loop_concerns(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
+    and what is narrow or rings near the bandwidth, against the usual limits of the field.
+
+    The step does not count where the case names the move that the stage makes.
+    """
+    found = [
+        words.format(result[key])
+        for key, least, words in USUAL
+        if result.get(key) is not None and result[key] < (1.0 - options.slack) * least
+    ]
+    if "step_overshoot" in result and "move" not in result:
+        overshoot = result["step_overshoot"]
+        if overshoot > options.overshoot:
+            usual = f"usual: at most {100.0 * options.overshoot:g}"
+            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
+        settled, followed = result["settling_ms"], LoopFigureOptions().periods
+        if settled is None:
+            found.append("a step does not settle within 2 %")
+        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
+            late = f"only after {with_unit(1e-3 * settled, 's')}"
+            found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
+    found += line_concern(result, options)
+    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
+
+
+def line_concern(
+    result: Mapping[str, Any], options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What |S| of a measured response may reach between its lines; empty where that is little.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConcernOptions
+
+    Returns
+    -------
+    list of str
+    """
+    reach = result.get("sensitivity_peak_between_lines")
+    if reach is None or reach <= max(1.0, options.between_lines * result["sensitivity_peak"]):
+        return []
+    where = result.get("sensitivity_peak_between_lines_hz")
+    at = "" if where is None else f" about {where:.4g} Hz"
+    return [f"|S| may reach {reach:.3g} between two lines{at}"]
+
+
+def current_concern(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
+    """What a move needs beyond the peak current of its motor; empty where it is enough.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConcernOptions
+
+    Returns
+    -------
+    list of str
+    """
+    move = result.get("move") or {}
+    share = move.get("needed_share")
+    if share is None or not share > 1.0 + options.slack:
+        return []
+    most = move["needed_current"] / share
+    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
+    return [f"{words}, and peak_current is {most:.4g} A"]
