@@ -1,5 +1,6 @@
 """The core works without its extensions: each is removed in a copy of the package."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from oracles.case_documents import QUICK_SECTIONS
 from oracles.sources import ROOT
 
 from ccd_casadi.support import extensions
@@ -90,6 +92,21 @@ def test_the_core_solves_without_each_extension(name: str, tmp_path: Path) -> No
     assert (done.returncode, done.stderr) == (0, "")
     done = run_without(tmp_path, name, words=solve_words(tmp_path))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.slow
+def test_sections_are_designed_and_deployed_without_any_extension(tmp_path: Path) -> None:
+    case, folder = tmp_path / "case.toml", tmp_path / "case"
+    case.write_text(QUICK_SECTIONS)
+    for words in (["solve", str(case)], ["deploy", str(folder)]):
+        done = run_without(
+            tmp_path, *NAMES, words=["-m", "ccd_casadi", *words, "--quiet", "--workers", "1"]
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads((folder / "result.json").read_text())
+    assert result["gap"] is None
+    assert "gap not known" in result["verdict"]["optimal"]["words"]
+    assert not (folder / "deploy" / "controller.st").exists()
 
 
 def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles.case_documents import SECTIONS_TABLES
+from oracles.case_documents import QUICK_SECTIONS as QUICK
 from oracles.contradictions import contradictions
 from oracles.helpers import problem
 
@@ -37,7 +37,8 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.lti.loop import sampled, tustin
-from ccd_casadi.reporting.concerns import ConditionOptions, advice
+from ccd_casadi.reporting.concerns import ConditionOptions
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
@@ -48,35 +49,6 @@ from surrogates.retrain import main as retrain_main
 
 COMMON = ["--quiet", "--workers", "1"]
 
-QUICK = f"""
-[plant]
-model = "two_mass"
-[theta.m1]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[theta.m2]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[objective]
-w1 = 0.0995
-w2 = -0.9950
-[inner]
-S_max = 1.75
-{SECTIONS_TABLES}
-[loop]
-rate_hz = 8000.0
-delay_us = 80.0
-[robust]
-gain = 0.02
-[sampling]
-points = 2
-[outer]
-box_points = 0
-"""
 
 
 @pytest.fixture(scope="module")
