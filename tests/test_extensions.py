@@ -109,6 +109,27 @@ def test_sections_are_designed_and_deployed_without_any_extension(tmp_path: Path
     assert not (folder / "deploy" / "controller.st").exists()
 
 
+HELLO = """
+from ccd_casadi.support.extensions import Extension
+
+EXTENSION = Extension(commands={"hello": ("ccd_casadi.extensions.hello", "greet a person")})
+
+
+def main(words):
+    print("hello", *words)
+    return 0
+"""
+
+
+def test_a_new_extension_is_one_file(tmp_path: Path) -> None:
+    file = tmp_path / "ccd_casadi" / "extensions" / "hello.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(HELLO)
+    done = run_without(tmp_path, words=["-m", "ccd_casadi", "hello", "you"])
+    assert (done.returncode, done.stdout, done.stderr) == (0, "hello you\n", "")
+    assert "greet a person" in run_without(tmp_path, words=["-m", "ccd_casadi"]).stdout
+
+
 def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
     own = Extension(commands={"drive": ("my_package.drive", "move it")})
     point = SimpleNamespace(name="drives", load=lambda: own)
