@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
-from ccd_casadi.studies.backends import SOLVERS, TITLES, synthesise_with, verdicts
+from ccd_casadi.extensions.cross_check.backends import SOLVERS, TITLES, synthesise_with, verdicts
 from ccd_casadi.support.worker_process import Runner
 
 sys.path += [str(Path(__file__).parents[1] / folder) for folder in (".", "tests")]

@@ -11,6 +11,8 @@ from ccd_casadi.codesign.run import solve as solve
 from ccd_casadi.codesign.run import verify as verify
 from ccd_casadi.codesign.verified import Solution as Solution
 from ccd_casadi.deployment.pipeline import deploy as deploy
+from ccd_casadi.extensions.measured.tuning import Tuned as Tuned
+from ccd_casadi.extensions.measured.tuning import tune as tune
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
@@ -21,16 +23,14 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem
 from ccd_casadi.inner_problem.problem import scaled_plant as scaled_plant
 from ccd_casadi.inner_problem.problem import true_design as true_design
 from ccd_casadi.inner_problem.problem import true_inner as true_inner
-from ccd_casadi.interop.frames import samples_frame as samples_frame
 from ccd_casadi.lti.loop import Sampling as Sampling
 from ccd_casadi.plants.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace
 from ccd_casadi.robust.study import robustness as robustness
+from ccd_casadi.sampling.frames import samples_frame as samples_frame
 from ccd_casadi.studies.comparison import compare as compare
-from ccd_casadi.studies.tuning import Tuned as Tuned
-from ccd_casadi.studies.tuning import tune as tune
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.text import HZ as HZ
 from ccd_casadi.synthesis.choice import choose_inputs as choose_inputs

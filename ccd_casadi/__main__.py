@@ -7,30 +7,24 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.interrupts import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.text import package_text, template
 
-# word -> the module of its `main`, and what it does
+# Of the core: word -> the module of its `main`, and what it does.
 COMMANDS = {
     "check": ("ccd_casadi.check", "examine a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "find the best controller at one theta, as JSON"),
-    "gap": ("ccd_casadi.gap", "bound what any controller reaches at one theta, as JSON"),
-    "record": ("ccd_casadi.record", "estimate a plant's response from records of its loop"),
-    "tune": ("ccd_casadi.tune", "find the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "design stage and controller together, verify, report"),
     "compare": ("ccd_casadi.compare", "run every method on a case, side by side"),
-    "worth": ("ccd_casadi.worth", "estimate in seconds what co-design gains"),
     "retrain": ("ccd_casadi.retrain", "add true samples to a run where they help most"),
     "insight": ("ccd_casadi.insight", "trade hardware cost against bandwidth"),
-    "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "find what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "write a run's controller as C, .mat and structured text"),
     "report": ("ccd_casadi.report", "draw the pages of a finished folder again"),
-    "cross_check": ("ccd_casadi.cross_check", "compare one synthesis by every back end"),
-    "imported": ("ccd_casadi.imported", "make a modal table from result files; also: ccd import"),
 }
 ALIASES = {"import": "imported"}
 TEMPLATE = ("plant.py", "case.toml")
@@ -48,6 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     named = ALIASES.get(words[0], words[0]) if words else ""
     if named in COMMANDS:
         return int(import_module(COMMANDS[named][0]).main(words[1:]))
+    if named in extensions.SHIPPED["commands"] or (
+        _is_new(named) and extensions.find("commands", named)
+    ):
+        return extensions.command(named)(words[1:])
     raise_on_ctrl_c()
     match words:
         case [] | ["--help" | "-h" | "help"]:
@@ -70,9 +68,19 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return _refuse(about)
             print(about)
         case _:
-            there = ", ".join((*COMMANDS, *OWN))
+            there = ", ".join((*commands(), *OWN))
             return _refuse(f"{words[0]!r} is not a command; there are {there}")
     return ExitCode.DONE
+
+
+def commands() -> dict[str, tuple[str, str]]:
+    """Every command that is installed: word -> the module of its `main`, and what it does."""
+    return COMMANDS | extensions.declared("commands")
+
+
+def _is_new(word: str) -> bool:
+    """Whether a word may be of an extension of another distribution, whose tables take time."""
+    return word.isidentifier() and word not in OWN and word != "help"
 
 
 def _refuse(words: str) -> int:
@@ -109,7 +117,7 @@ def overview(folder: Path) -> str:
     near = [*sorted(folder.glob("*/result.json")), *sorted(folder.glob("*/*/result.json"))]
     runs = [path.parent for path in near]
     files = [*sorted(folder.glob("*.toml")), *sorted(folder.glob("*/*.toml"))]
-    words = [*((word, does) for word, (_, does) in COMMANDS.items()), *OWN.items()]
+    words = [*((word, does) for word, (_, does) in commands().items()), *OWN.items()]
     cases = [path for path in files if _is_case(path)]
     made = template("templates/overview.txt").render(words=words, cases=cases, runs=runs)
     return made.rstrip()

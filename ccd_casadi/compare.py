@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, run_folder
-from ccd_casadi.support.process_pool import PoolOptions
+from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -39,7 +39,6 @@ def table(comparison: "Comparison") -> str:
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.schema import case_to_toml
-    from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.studies.comparison import compare, comparison_dict
     from ccd_casadi.studies.steepest_descent import case_to_compare
     from ccd_casadi.support.json_files import write_json

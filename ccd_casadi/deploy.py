@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, option, positive, real, valued
@@ -62,6 +63,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
+    structured_text = extensions.function("structured_text")
+    write_fmu = extensions.function("fmu") if options.fmu else None
+    if options.fmu and write_fmu is None:
+        raise UserError(extensions.missing("--fmu", "functions", "fmu"))
     finished = read_run(options.run)
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
@@ -100,7 +105,7 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FILE):
+    for name in (*DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FMU_FILE):
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
@@ -109,9 +114,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
                                   "kind": kind}  # fmt: skip
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
-        code = source_code.structured_text(K, **naming)
-        (folder / source_code.ST_FILE).write_text(code, "utf-8")
-        if options.fmu and not source_code.write_fmu(folder / source_code.FILE, K, texts, name):
+        if structured_text is not None:
+            code = structured_text(K, **naming)
+            (folder / source_code.ST_FILE).write_text(code, "utf-8")
+        if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(
         finished, folder, "deployable", deployed_line(finished, found, moved)

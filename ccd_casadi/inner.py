@@ -67,8 +67,13 @@ def main(options: argparse.Namespace) -> ExitCode:
 def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
-    from ccd_casadi.studies.measured_answer import measured_answer
+    from ccd_casadi.support import extensions
 
+    measured_answer = extensions.function("measured_answer")
+    measured_page = extensions.function("measured_page")
+    if measured_answer is None or measured_page is None:
+        words = extensions.missing("'measured'", "functions", "measured_answer")
+        raise CaseError(f"{case.path}: plant.model: {words}")
     given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
@@ -78,7 +83,6 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
         from ccd_casadi.drawing.paint import write_page
-        from ccd_casadi.reporting.structured_page import measured_page
 
         folder = run_folder(options.case, options.out)
         answer = {"status": found.status, **found.figures}

@@ -9,7 +9,7 @@ import argparse
 
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, valued
-from ccd_casadi.support.process_pool import PoolOptions
+from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import inform
 
 
@@ -23,7 +23,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.pareto import insight_dict, pareto_front
     from ccd_casadi.codesign.run import outer_of
-    from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.json_files import write_json

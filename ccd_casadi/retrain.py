@@ -9,7 +9,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, option, real, valued
-from ccd_casadi.support.process_pool import PoolOptions
+from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
 
@@ -42,7 +42,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.result import write_run
     from ccd_casadi.codesign.retraining import Job, only_job, publish
     from ccd_casadi.codesign.run import outer_of, require_solvable
-    from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
 

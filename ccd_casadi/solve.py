@@ -10,7 +10,7 @@ from ccd_casadi.cases.first_look import DRAWING, SAMPLING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.options import positive
-from ccd_casadi.support.process_pool import PoolOptions
+from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.text import counted
 
@@ -145,7 +145,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.result import resolved, write_run
     from ccd_casadi.codesign.run import within
     from ccd_casadi.inner_problem.problem import plant_of
-    from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
 

@@ -14,10 +14,10 @@ MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
 
 def options() -> str:
     """Every command, as its --help prints it."""
-    from ccd_casadi.__main__ import COMMANDS
+    from ccd_casadi.__main__ import commands
 
     found = []
-    for word, (module, _) in COMMANDS.items():
+    for word, (module, _) in commands().items():
         text, wide = StringIO(), mock.patch.dict("os.environ", COLUMNS="100")
         with redirect_stdout(text), mock.patch.object(sys, "argv", ["ccd"]), wide:
             import_module(module).main(["--help"])

@@ -27,13 +27,13 @@ from ccd_casadi.cases.controller_kinds import (
     structure_of,
     weights_of,
 )
+from ccd_casadi.cases.plant_tables import MEASURED
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ, use_units
 
-MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop", "units")
 _PLANT = {
     "model": text,
@@ -89,13 +89,13 @@ def measured_case(path: Path) -> MeasuredCase | None:
     """
     data = read_toml(path)
     plant = data.get("plant")
-    if not isinstance(plant, Mapping) or plant.get("model") != MODEL:
+    if not isinstance(plant, Mapping) or plant.get("model") != MEASURED:
         return None
 
     fail = Fail(path)
     for name, table in data.items():
         if name not in ("plant", *_TABLES):
-            words = f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
+            words = f'has no effect on plant.model = "{MEASURED}", which has no theta; drop it'
             raise fail(name, words)
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
@@ -136,7 +136,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
 def _response(plant: Mapping[str, Any], path: Path, fail: Fail) -> MeasuredResponse:
     require_good("plant", plant, _PLANT, fail)
     if "file" not in plant:
-        raise fail("plant.file", f"is missing; add it, which {MODEL} needs")
+        raise fail("plant.file", f"is missing; add it, which {MEASURED} needs")
     try:
         found = read_frequency_response(path.parent / plant["file"])
     except UserError as error:

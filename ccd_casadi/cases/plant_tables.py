@@ -10,8 +10,10 @@ from typing import Any
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import Check, Fail, short_repr
 from ccd_casadi.cases.tables import Parameter, PlantTable
-from ccd_casadi.plants.registry import OWN, model_named, model_names
+from ccd_casadi.plants.registry import model_named, model_names
+from ccd_casadi.support import extensions
 
+MEASURED = "measured"  # the model of `measured_case`, which has no θ
 # Checks of a model's options that its builder's annotations do not say, by their names.
 _OPTIONS: dict[str, Check] = {
     "zeta": checks.FRACTION,
@@ -42,6 +44,8 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     if (model is None) == (function is None):
         raise fail("plant", "give either model or function, and not both")
     known = model_named(model) if isinstance(model, str) else None
+    if known is None and isinstance(model, str) and model in extensions.SHIPPED["plants"]:
+        raise fail("plant.model", extensions.missing(short_repr(model), "plants", model))
     if model is not None and known is None:
         hint = checks.closest(str(model), model_names())
         words = f"is {short_repr(model)}, not a known model{hint}; or use function"
@@ -60,7 +64,7 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         own = list(takes)[1:]
         if takes and key not in own:
             raise fail(f"plant.{key}", f"is not an option of {model}{checks.closest(key, own)}")
-        usual = _check_of(takes[key]) if model in OWN else _option
+        usual = _check_of(takes[key]) if known is not None and known.annotated else _option
         wrong = own_checks.get(key, usual)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)

@@ -40,7 +40,6 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
@@ -130,6 +129,8 @@ class FinishedRun(NotebookHtml):
         `control.feedback(G * K, 1)` is T. What a sampled loop of sections runs is Tustin's rule of
         K, `control.c2d(K, period, "tustin")`, behind its delay.
         """
+        from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
+
         plant, controller = named_plant(self.plant.plant_si()), named_controller(self.controller)
         return to_control(plant, "plant"), to_control(controller, "controller")
 

@@ -13,8 +13,8 @@ from typing import Any
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
 from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
-from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.plant_tables import KEYS as THETA
+from ccd_casadi.cases.plant_tables import MEASURED
 from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
 from ccd_casadi.plants.registry import model_names
 from ccd_casadi.support.errors import UserError

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
@@ -42,17 +41,20 @@ from ccd_casadi.inner_problem.structured_plant_set import structure_of, structur
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
-from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.structured_units import NeighbourOptions
+from ccd_casadi.support import extensions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 from ccd_casadi.support.worker_process import alongside
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ class StructuredOuter(ThetaOuter):
         certificate = partial(theta_kkt, problem, best, sampler, end.inner.envelope, beside)
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
-        def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
+        def judged() -> "tuple[SetCertificate, int, Proof, Yield | None]":
             whole = on_box.judged(worst, sampler.workers)
             drawn = None if whole[-1].conclusive else on_box.fresh_yield(sampler.workers)
             return *whole, drawn
@@ -208,7 +210,8 @@ class StructuredOuter(ThetaOuter):
             kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
-            gap = known_gap(problem, best.theta)
+            known_gap = extensions.function("known_gap")
+            gap = None if known_gap is None else known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
             survival = survived(problem, loops, design)[0]
             damping, told = other_damping(problem, loops), None
@@ -272,7 +275,9 @@ def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) ->
     """Whether it is shown that J is at least that at θ."""
     if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
         return False
-    return none_reaches(problem, theta, (least - objective(problem, theta, 0.0)) / problem.w2)
+    none_reaches = extensions.function("none_reaches")
+    reached = (least - objective(problem, theta, 0.0)) / problem.w2
+    return none_reaches is not None and none_reaches(problem, theta, reached)
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue | None) -> float:

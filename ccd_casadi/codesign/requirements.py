@@ -16,7 +16,6 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words, kind_and_channel
-from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import constraint_sizes
 from ccd_casadi.inner_problem.problem import plant_of
@@ -144,7 +143,7 @@ def _required(bounds: Bounds) -> dict[str, float]:
 
 def _proven(verified: Verified) -> set[str]:
     """Which of the judge's figures a proof holds on the whole set."""
-    if not isinstance(verified, VerifiedStructured) or verified.proof.outcome in NOT_APPLICABLE:
+    if not isinstance(verified, VerifiedStructured) or not verified.proof.applies:
         return set()
     proof = verified.proof
     raw = {"S_MAX": "S_max", "S_LOW": "S_low"}

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import BINDS, Place, key_words, kind_and_channel
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
-from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
@@ -26,9 +26,13 @@ from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
@@ -329,7 +333,7 @@ def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, A
     }
 
 
-def proof_dict(proof: Proof) -> dict[str, Any]:
+def proof_dict(proof: "Proof") -> dict[str, Any]:
     """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
     found: dict[str, Any] = {
         "outcome": proof.outcome.name.lower(),
@@ -348,14 +352,25 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
     return found
 
 
-def sections_controller(
-    design: SectionsDesign | MeasuredDesign, sampling: Sampling | None
-) -> dict[str, Any]:
+class WithSections(Protocol):
+    """A design that may have a controller of sections."""
+
+    @property
+    def structure(self) -> Structure | ChannelStructure: ...
+
+    @property
+    def kappa(self) -> Array: ...
+
+    @property
+    def controller(self) -> StateSpace | None: ...
+
+
+def sections_controller(design: WithSections, sampling: Sampling | None) -> dict[str, Any]:
     """The content of controller.json: the state space, the sections, and how they run.
 
     Parameters
     ----------
-    design : SectionsDesign or MeasuredDesign
+    design : WithSections
         With a controller.
     sampling : Sampling or None
         Of the loop.
@@ -367,15 +382,13 @@ def sections_controller(
     """
     assert design.controller is not None
     words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
-    if isinstance(design, MeasuredDesign):
-        words["sign"] = design.sign
     if sampling is not None:
         words["loop"] = vars(sampling) | {"method": "tustin"}
     return controller_dict(design.controller) | {"sections": words}
 
 
 def box_words(
-    wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
+    wide: SetCertificate, checked: int, proof: "Proof", worst: Excess, drawn: Yield | None,
     *, along: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Arguments of `survives` for a loop on its box of plants.

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
@@ -20,7 +20,6 @@ from ccd_casadi.codesign.result_entries import (
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
@@ -36,11 +35,13 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     with_structured,
 )
-from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import HZ, counted, told_apart
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,16 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))
+
+
+class Gap(Protocol):
+    """What is known of every controller, of the extension `limitations`."""
+
+    def words(self, bandwidth: float) -> str:
+        """Of the verdict, with a design's ω_b in rad/s."""
+
+    def entry(self, bandwidth: float) -> dict[str, Any]:
+        """Of result.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +110,7 @@ class VerifiedStructured(Verified):
     multistart: StructuredValue | None
     wide: SetCertificate
     checked: int
-    proof: Proof
+    proof: "Proof"
     drawn: Yield | None
     worst: Excess
     rounds: int

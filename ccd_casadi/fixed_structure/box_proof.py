@@ -225,9 +225,14 @@ class Proof:
         return self.refuted or self.outcome is ProofOutcome.UNSTABLE
 
     @property
+    def applies(self) -> bool:
+        """Whether plants of this kind are enclosed."""
+        return self.outcome not in NOT_APPLICABLE
+
+    @property
     def unasked(self) -> str:
         """Why the proof does not apply, or is not of every bound; empty where it is of all."""
-        if self.outcome in NOT_APPLICABLE:
+        if not self.applies:
             return self.outcome.value
         return "bounds of single channels are judged, not proven" if self.channels else ""
 

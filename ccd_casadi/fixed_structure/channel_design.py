@@ -43,7 +43,6 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent, titled
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
 
 @one_blas_thread
@@ -141,6 +140,8 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
     for i, system in enumerate(scaled):
         if isinstance(system, ScaledPlant):
             continue
+        from ccd_casadi.synthesis.interchange import from_control, plant_from_control
+
         if scale is None:
             space = from_control(system)
             order, gain = leading_gain(space)

@@ -12,7 +12,7 @@ that a search has made of the plant takes part. What cannot be judged is unknown
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate,
 from ccd_casadi.fixed_structure.certificate_responses import as_run, holds
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.text import HZ, counted
+
+if TYPE_CHECKING:
+    from ccd_casadi.plants.measured import MeasuredResponse
 
 ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
 AS_GIVEN = "NumPy, on the plants as they were given, with the coefficients of the code"
@@ -154,7 +156,7 @@ def judge_loops(
 
 
 def judge_lines(
-    measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, delay: float,
+    measured: "MeasuredResponse", controller: StateSpace, bounds: Bounds, delay: float,
     bandwidth: float, integrator: bool, options: JudgementOptions = JudgementOptions(),
 ) -> Judgement:  # fmt: skip
     """A controller, continuous or a difference equation, on a response as its file has it.

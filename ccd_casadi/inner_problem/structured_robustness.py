@@ -7,12 +7,12 @@ of the box beside them, branch and bound at all of it.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import call
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -43,6 +43,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, of_a_bound
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.box_proof import Proof
 
 
 @dataclass(frozen=True)
@@ -182,15 +185,17 @@ class DesignOnBox:
         ]  # fmt: skip
         return Yield(sum(kept), count)
 
-    def proof(self, workers: Pool | None = None) -> Proof:
+    def proof(self, workers: Pool | None = None) -> "Proof":
         """Branch and bound over the whole box."""
+        from ccd_casadi.fixed_structure.box_proof import prove
+
         design, problem = self.design, self.problem
         return prove(
             self.uncertain, design.structure, design.kappa, design.bandwidth, bounds_of(problem),
             problem.sampling, workers=workers,
         )  # fmt: skip
 
-    def judged(self, worst: Excess, workers: Pool) -> tuple[SetCertificate, int, Proof]:
+    def judged(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":
         """On a lattice and by proof, at one time; of several options, whose proofs are spread over
         the workers, one after the other."""
         if structured_of(self.problem).uncertainty.options:

@@ -1,14 +1,15 @@
-"""The plants that a case file may name: case study 1, and those of installed packages."""
+"""The plants that a case file may name: case study 1, those of extensions and of packages."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 
 from ccd_casadi.plants.plant import Plant, build_plant
+from ccd_casadi.support import extensions
 
 
 def two_mass(theta: Mapping[str, Any], zeta: float = 0.01) -> dict[str, Any]:
@@ -55,6 +56,8 @@ class Model:
         The option that names its data, relative to the case file.
     sound : bool
         Whether it is known to be sound: it is then not diagnosed on loading.
+    annotated : bool
+        Whether the annotations of `build` say what each option takes.
     """
 
     build: Callable[..., Plant]
@@ -62,25 +65,10 @@ class Model:
     checks: Mapping[str, Callable[[Any], str | None]] = field(default_factory=dict)
     data: str = ""
     sound: bool = False
+    annotated: bool = False
 
 
-OWN = ("two_mass", "modal_table", "sampled_matrices", "cad_stage")
-
-
-def _own(name: str) -> Model:
-    """Finite elements and files of many formats take a sixth of a second to import, which a case
-    that names neither does not wait for."""
-    if name == "two_mass":
-        return Model(two_mass_plant, theta=("m1", "m2"), sound=True)
-    if name == "cad_stage":
-        from ccd_casadi.plants.cad.cad_stage import cad_stage
-
-        return Model(cad_stage, data="morph")
-    from ccd_casadi.plants.imported.sampled_plant import modal_table, sampled_matrices
-
-    if name == "modal_table":
-        return Model(modal_table, data="table")
-    return Model(sampled_matrices, data="folder")
+TWO_MASS = Model(two_mass_plant, theta=("m1", "m2"), sound=True, annotated=True)
 
 
 @cache
@@ -96,7 +84,7 @@ def model_names() -> list[str]:
     list of str
         Sorted.
     """
-    return sorted({*OWN, *_offered()})
+    return sorted({"two_mass", *extensions.declared("plants"), *_offered()})
 
 
 @cache
@@ -112,9 +100,11 @@ def model_named(name: str | None) -> Model | None:
     Model or None
         None where there is none of that name.
     """
-    if name is not None and name in OWN:
-        return _own(name)
-    if name is None or name not in _offered():
+    if name is None or name == "two_mass":
+        return TWO_MASS if name else None
+    if place := extensions.find("plants", name):
+        return cast(Model, extensions.load(place))
+    if name in extensions.SHIPPED["plants"] or name not in _offered():
         return None
     found = _offered()[name].load()
     return found if isinstance(found, Model) else Model(found)

@@ -29,6 +29,7 @@ from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitiv
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.reporting.structured_page import structured_table
+from ccd_casadi.support.extensions import function
 from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 POINTS = 900
@@ -180,4 +181,5 @@ def _root(root: Root | None) -> tuple[str, str]:
 
 
 def _code(found: Deployment) -> tuple[c.Block, ...]:
-    return *_words("code", found.realisation), c.Source(f"{COMPILE}\n./controller_test")
+    text = function("structured_text") is not None
+    return *_words("code", found.realisation, text), c.Source(f"{COMPILE}\n./controller_test")

@@ -10,8 +10,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from multiprocessing import connection
 from reprlib import Repr
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar, cast
 
+from ccd_casadi.support import extensions
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.interrupts import raise_dropped
 from ccd_casadi.support.time_budget import InTime
 from ccd_casadi.support.worker_process import (
@@ -46,7 +48,7 @@ class PoolOptions:
 
 
 class Pool(Protocol):
-    """A context manager that spreads tasks over processes: `Workers`, or `cluster.Cluster` (Dask).
+    """A context manager that spreads tasks over processes: `Workers`, or a `Cluster` (Dask).
 
     Leaving it ends or abandons the tasks in flight.
 
@@ -216,3 +218,33 @@ def results(
 def _keyed(task: tuple[K, Callable[..., R], tuple[Any, ...]]) -> tuple[K, R]:
     key, function, arguments = task
     return key, function(*arguments)
+
+
+def pool(scheduler: str | None, count: int, patience: float) -> Pool:
+    """Make the pool of a command: local processes, or a Dask cluster.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of a Dask scheduler; None: local processes.
+    count : int
+        Local processes at most.
+    patience : float
+        Work in s below which no local processes are started.
+
+    Returns
+    -------
+    Pool
+        A context manager that has not been entered.
+
+    Raises
+    ------
+    UserError
+        The extension `cluster` was removed.
+    """
+    if scheduler is None:
+        return Workers(count, patience)
+    cluster = extensions.function("cluster")
+    if cluster is None:
+        raise UserError(extensions.missing("--scheduler", "functions", "cluster"))
+    return cast(Pool, cluster(scheduler))

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from stage import BOUNDS, solid
 
-from ccd_casadi.plants.cad.cad_stage import cad_stage
-from ccd_casadi.plants.cad.solid import kernel, load
+from ccd_casadi.extensions.cad.cad_stage import cad_stage
+from ccd_casadi.extensions.cad.solid import kernel, load
 
 HERE = Path(__file__).parent
 SIZE = 6e-3  # m, of the elements of CalculiX, curved where the solid is

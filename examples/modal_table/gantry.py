@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.plants.imported.modal_table import ModalTable, write_modal_table
+from ccd_casadi.extensions.imported.modal_table import ModalTable, write_modal_table
 
 LENGTH, WIDTH, ELEMENTS = 0.8, 0.06, 24  # m; the tube is WIDTH across the motion
 YOUNG, DENSITY = 69e9, 2700.0  # aluminium

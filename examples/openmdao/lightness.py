@@ -10,7 +10,7 @@ from pathlib import Path
 import openmdao.api as om
 
 import ccd_casadi as ccd
-from ccd_casadi.interop.openmdao import CertifiedLoop, pose
+from ccd_casadi.extensions.openmdao.components import CertifiedLoop, pose
 
 CASE = Path(__file__).parent.parent.parent / "runs" / "two_mass.toml"
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.linalg import eigh
 
-from ccd_casadi.plants.imported.modal_table import ModalTable, write_modal_table
+from ccd_casadi.extensions.imported.modal_table import ModalTable, write_modal_table
 
 LENGTH, WIDTH = 0.36, 0.24  # m
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # aluminium

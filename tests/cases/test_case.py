@@ -198,7 +198,7 @@ def test_what_is_known_of_the_models_is_what_they_take() -> None:
                 model.build(tuple(sorted(set(theta) - {gone})))
         takes = inspect.signature(model.build).parameters
         assert {*model.checks, model.data} <= {"", *takes}
-        if name in registry.OWN:  # every option has a check, by its name or its annotation
+        if model.annotated:  # every option has a check, by its name or its annotation
             checks = [plant_tables._check_of(takes[each]) for each in list(takes)[1:]]
             assert plant_tables._option not in checks
 

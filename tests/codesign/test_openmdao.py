@@ -15,7 +15,7 @@ from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.support.errors import UserError
 
 om = pytest.importorskip("openmdao.api", reason="OpenMDAO is not installed (the extra `openmdao`)")
-from ccd_casadi.interop.openmdao import CertifiedLoop, LargestBandwidth, pose  # noqa: E402
+from ccd_casadi.extensions.openmdao.components import CertifiedLoop, LargestBandwidth, pose  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 # what OpenMDAO itself calls in a way that newer versions of others warn of is not ours to mend

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,6 @@ from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.sampling import cluster
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
 from ccd_casadi.support.process_pool import Workers
@@ -216,7 +216,8 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
 ) -> None:
     """To the last bit, seconds aside; the pool is started although the work is short."""
-    monkeypatch.setattr(cluster, "pool", lambda scheduler, count, patience: Workers(count))
+    command = sys.modules[main.__module__]
+    monkeypatch.setattr(command, "pool", lambda scheduler, count, patience: Workers(count))
     quick = "\n[sampling]\npoints = 2\nlifted_points = 12\n[outer]\nstarts = 2\nbox_points = 4\n"
     case = changed(tmp_path, more=quick + "max_refinements = 0\n")
     for workers in ("1", "2"):

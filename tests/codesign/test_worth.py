@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from ccd_casadi import HZ, Lifted, load_case, problem_of, solve
+from ccd_casadi.extensions.worth import worth_estimate as worth
+from ccd_casadi.extensions.worth.command import main
+from ccd_casadi.extensions.worth.worth_estimate import outlook, search_error
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.studies import worth_estimate as worth
-from ccd_casadi.studies.worth_estimate import outlook, search_error
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.worth import main
 from surrogates import design
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"

@@ -17,23 +17,29 @@ from typing import Any
 import jsonschema
 import pytest
 
-from ccd_casadi.__main__ import ALIASES, COMMANDS, OWN, main, overview
+from ccd_casadi.__main__ import ALIASES, OWN, commands, main, overview
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.robust import demands
+from ccd_casadi.support import extensions
 
 ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = commands()
 
 
 def test_every_word_has_a_command_and_the_entry_point_is_there() -> None:
     for module, _ in COMMANDS.values():
         assert callable(import_module(module).main)
     every = [*(ROOT / "ccd_casadi").glob("*.py"), *(ROOT / "surrogates").glob("*.py")]
-    commands = {f"{p.parent.name}.{p.stem}" for p in every if "def main(" in p.read_text()}
-    assert commands - {"ccd_casadi.__main__"} == {module for module, _ in COMMANDS.values()}
+    words = {f"{p.parent.name}.{p.stem}" for p in every if "\n@command(" in p.read_text()}
+    assert words == {module for module, _ in COMMANDS.values() if module.count(".") == 1}
+    thin = {p.stem for p in every if "\nmain = command(" in p.read_text()}
+    assert thin == set(extensions.SHIPPED["commands"]) == {
+        word for word, (module, _) in COMMANDS.items() if module.count(".") > 1
+    }
     assert set(ALIASES.values()) <= set(COMMANDS)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     module, _, name = project["scripts"]["ccd"].partition(":")

@@ -11,7 +11,7 @@ from itertools import chain
 import pytest
 from oracles.sources import ROOT, SOURCES, nodes
 
-from ccd_casadi.__main__ import COMMANDS
+from ccd_casadi.__main__ import commands
 from ccd_casadi.reporting.run_verdict import FILES
 from ccd_casadi.support.text import package_text
 
@@ -82,7 +82,7 @@ def test_the_page_of_commands_has_every_option_file_and_key() -> None:
     spec.loader.exec_module(generated)
     page = generated.on_page_markdown((DOCS / "commands.md").read_text())
     assert "<!--" not in page
-    for word in COMMANDS:
+    for word in commands():
         own = page.partition(f"### ccd {word}\n")[2].partition("\n###")[0]
         assert f"usage: ccd {word} [-h]" in own
         assert "Exit codes: 0 done" in own

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.plants.imported.modal_table import read_modal_table, write_modal_table
+from ccd_casadi.extensions.imported.modal_table import read_modal_table, write_modal_table
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant

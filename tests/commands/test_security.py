@@ -11,8 +11,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from test_sources import SOURCES
 
+from ccd_casadi.__main__ import commands
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
@@ -66,14 +66,8 @@ def trapped_run(two_mass_run: Path, trap: Path) -> Path:
 
 OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy", "ccd_casadi.robustness",
             "ccd_casadi.retrain", "ccd_casadi.report"}  # fmt: skip
-COMMANDS = sorted(
-    {
-        ".".join(p.relative_to(ROOT).with_suffix("").parts)
-        for p in SOURCES
-        if "\n@command(" in p.read_text()
-    }
-    - {f"ccd_casadi.{name}" for name in ("imported", "record", "tune")}  # take numbers, no case
-)
+NUMBERS = ("imported", "record", "tune")  # take numbers, no case
+COMMANDS = sorted(module for word, (module, _) in commands().items() if word not in NUMBERS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -10,13 +10,13 @@ import numpy as np
 from oracles.sources import ROOT, SOURCES, nodes
 
 # Pipes between the processes of one run.
-LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"}
+LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/extensions/cluster/dask_pool.py"}
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {
-    ("ccd_casadi/deployment/source_code.py", "subprocess.run"),
+    ("ccd_casadi/extensions/formats/fmu.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/explorer/known_plant.py", "subprocess.Popen"),
+    ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }
@@ -28,6 +28,7 @@ BY_NAME = {
     "ccd_casadi/kernels/compiled.py",
     "surrogates/lazy_names.py",
     "ccd_casadi/__main__.py",
+    "ccd_casadi/support/extensions.py",
 }
 
 
@@ -59,7 +60,7 @@ def test_no_source_reads_code_from_data() -> None:
             ):
                 assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
             if (
-                called == "require" and name != "ccd_casadi/studies/backends.py"
+                called == "require" and name != "ccd_casadi/extensions/cross_check/backends.py"
             ):  # its constants
                 assert isinstance(node.args[0], ast.Constant), f"{name}:{node.lineno}"
             for keyword in node.keywords:

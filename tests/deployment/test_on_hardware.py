@@ -35,7 +35,8 @@ from ccd_casadi.deployment.realisation import (
     takeover,
     with_anti_windup,
 )
-from ccd_casadi.deployment.source_code import structured_text, vectors
+from ccd_casadi.deployment.source_code import vectors
+from ccd_casadi.extensions.formats.structured_text import structured_text
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant

@@ -22,6 +22,7 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.extensions.measured.measured_answer import measured_answer
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -31,7 +32,6 @@ from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.studies.measured_answer import measured_answer
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis import derivatives, synthesis
 

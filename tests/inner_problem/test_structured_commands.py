@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles.case_documents import SECTIONS_TABLES
+from oracles.case_documents import QUICK_SECTIONS as QUICK
 from oracles.contradictions import contradictions
 from oracles.helpers import problem
 
@@ -23,21 +23,22 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.extensions.limitations.command import main as gap_main
+from ccd_casadi.extensions.limitations.limits import discs
+from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
+from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
-from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
-from ccd_casadi.limitations.limits import discs
-from ccd_casadi.limitations.multiplier import MultiplierBasis
-from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
-from ccd_casadi.reporting.concerns import ConditionOptions, advice
+from ccd_casadi.reporting.concerns import ConditionOptions
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
@@ -48,35 +49,6 @@ from surrogates.retrain import main as retrain_main
 
 COMMON = ["--quiet", "--workers", "1"]
 
-QUICK = f"""
-[plant]
-model = "two_mass"
-[theta.m1]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[theta.m2]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[objective]
-w1 = 0.0995
-w2 = -0.9950
-[inner]
-S_max = 1.75
-{SECTIONS_TABLES}
-[loop]
-rate_hz = 8000.0
-delay_us = 80.0
-[robust]
-gain = 0.02
-[sampling]
-points = 2
-[outer]
-box_points = 0
-"""
 
 
 @pytest.fixture(scope="module")

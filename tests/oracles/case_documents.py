@@ -47,6 +47,36 @@ structure = "sections"
 starts = 4
 weighted_level = 8.426
 biquads = 0"""
+# Solved in seconds.
+QUICK_SECTIONS = f"""
+[plant]
+model = "two_mass"
+[theta.m1]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[theta.m2]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[objective]
+w1 = 0.0995
+w2 = -0.9950
+[inner]
+S_max = 1.75
+{SECTIONS_TABLES}
+[loop]
+rate_hz = 8000.0
+delay_us = 80.0
+[robust]
+gain = 0.02
+[sampling]
+points = 2
+[outer]
+box_points = 0
+"""
 
 
 def edited(*changes: tuple[str, Any]) -> dict[str, Any]:

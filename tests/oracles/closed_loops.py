@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete, csd, welch
 
-from ccd_casadi.records.plant_estimate import EstimateOptions, PlantEstimate, estimate_plant
-from ccd_casadi.records.time_series import TimeSeries
+from ccd_casadi.extensions.records.plant_estimate import (
+    EstimateOptions,
+    PlantEstimate,
+    estimate_plant,
+)
+from ccd_casadi.extensions.records.time_series import TimeSeries
 
 COHERENT = 0.8
 RATE = 2000.0

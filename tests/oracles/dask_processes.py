@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.extensions.cluster.dask_pool import Cluster
 
 TESTS = Path(__file__).parents[1]
 

@@ -10,8 +10,8 @@ import control
 import numpy as np
 from scipy.linalg import block_diag
 
+from ccd_casadi.extensions.cross_check.backends import StandardPlant
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.studies.backends import StandardPlant
 from ccd_casadi.support.arrays import Array
 
 Rows = list[list[float]]

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.extensions.cross_check.backends import Attempt, StandardPlant, balance
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.studies.backends import Attempt, StandardPlant, balance
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import require
 

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
-from ccd_casadi.case_studies.rib_stage.geometry import NAMES
-from ccd_casadi.case_studies.rib_stage.plant import rib_stage
+from ccd_casadi.extensions.rib_stage.geometry import NAMES
+from ccd_casadi.extensions.rib_stage.plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop

@@ -64,7 +64,7 @@ def test_words_of_a_page_can_be_read(which: int) -> None:
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_words_of_the_explorer_can_be_read(which: int) -> None:
-    sheet = package_text("explorer/page.html").split("<style>")[1].split("</style>")[0]
+    sheet = package_text("extensions/explorer/page.html").split("<style>")[1].split("</style>")[0]
     choice = r'\{\{ "([^"]*)" if dark else "([^"]*)" \}\}'
     sheet = re.sub(choice, lambda found: found[1] if which else found[2], sheet)
     sheet = sheet.replace("{{ css }}", "")

@@ -12,7 +12,7 @@ from oracles.kept_pictures import picture
 
 from ccd_casadi import explore
 from ccd_casadi.cases.case import load_case
-from ccd_casadi.explorer.session import Session
+from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support import errors
 from ccd_casadi.support.text import package_text
@@ -189,10 +189,10 @@ def test_a_circle_is_round_without_a_browser_too(width):
     """The page's own arithmetic, in the JavaScript that playwright brings: CI has no Chromium."""
     api = pytest.importorskip("playwright", reason="playwright is not installed")
     pytest.importorskip("bokeh", reason="bokeh is not installed")
-    from ccd_casadi.explorer.painter import CENTRE, HALF
+    from ccd_casadi.extensions.explorer.painter import CENTRE, HALF
 
     size = {"inner_width": width - 70, "inner_height": 180}
-    fit = package_text("explorer/assets/round.js")
+    fit = package_text("extensions/explorer/assets/round.js")
     code = f"""
 const axis = () => ({{setv(found) {{ Object.assign(this, found) }}}})
 const figure = {{...{json.dumps(size)}, x_range: axis(), y_range: axis()}}
@@ -211,7 +211,7 @@ def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):
     embed = pytest.importorskip("bokeh.embed", reason="bokeh is not installed")
     from bokeh.resources import INLINE
 
-    from ccd_casadi.explorer.painter import PanelFigure
+    from ccd_casadi.extensions.explorer.painter import PanelFigure
 
     place = tmp_path / "nyquist.html"
     made = PanelFigure("nyquist", "", False, whole_circles=True)
@@ -228,7 +228,9 @@ def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):
 
 def test_without_the_token_every_path_is_refused(tmp_path):
     client = pytest.importorskip("tornado.httpclient").AsyncHTTPClient
-    server = pytest.importorskip("ccd_casadi.explorer.server", reason="bokeh is not installed")
+    server = pytest.importorskip(
+        "ccd_casadi.extensions.explorer.server", reason="bokeh is not installed"
+    )
     explorer = server.Explorer(Session(load_case("runs/two_mass.toml"), tmp_path), workers=1)
     token = explorer.url.rstrip("/").rsplit("/", 1)[1]
     root = explorer.url.split(token)[0]
@@ -263,7 +265,7 @@ def test_a_page_from_elsewhere_gets_no_socket(tmp_path):
     from tornado.httpclient import HTTPClientError, HTTPRequest
     from tornado.websocket import websocket_connect
 
-    from ccd_casadi.explorer.server import Explorer
+    from ccd_casadi.extensions.explorer.server import Explorer
 
     explorer = Explorer(Session(load_case("runs/two_mass.toml"), tmp_path), workers=1)
     own = explorer.url.rpartition(explorer.url.split("/")[3])[0].rstrip("/")

@@ -11,8 +11,8 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
-from ccd_casadi.explorer.controls import landscape_of, steepest_axes
-from ccd_casadi.explorer.curves import (
+from ccd_casadi.extensions.explorer.controls import landscape_of, steepest_axes
+from ccd_casadi.extensions.explorer.curves import (
     FIGURES,
     as_sampled,
     curves_of,
@@ -23,7 +23,7 @@ from ccd_casadi.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.explorer.designs import (
+from ccd_casadi.extensions.explorer.designs import (
     How,
     Problems,
     Standing,
@@ -33,8 +33,8 @@ from ccd_casadi.explorer.designs import (
     knobs_of,
     present,
 )
-from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
-from ccd_casadi.explorer.session import Session
+from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
+from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.places import Places
@@ -247,7 +247,9 @@ def test_margins_are_drawn_where_the_loop_has_them(session):
 
 
 def test_every_panel_can_be_painted_marks_with_words_alone_too(session, searched_look):
-    painter = pytest.importorskip("ccd_casadi.explorer.painter", reason="bokeh is not installed")
+    painter = pytest.importorskip(
+        "ccd_casadi.extensions.explorer.painter", reason="bokeh is not installed"
+    )
     panels = drawn(searched_look, curves_of(searched_look), None).panels
     assert any(mark.text and not mark.marker for p in panels.values() for mark in p.marks)
     for name, (heading, log_x, log_y) in FIGURES.items():
@@ -299,7 +301,7 @@ def test_a_saved_case_is_the_one_on_the_sliders(session):
 def test_a_place_that_is_dragged_moves_what_it_names():
     """A mirrored coordinate the other way, a diagonal by the mean, what is held not at all."""
     pytest.importorskip("bokeh")
-    from ccd_casadi.explorer.controls import PlacesFigure, moves
+    from ccd_casadi.extensions.explorer.controls import PlacesFigure, moves
 
     nodes = tuple((x, y) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.0, 0.1))
     places = Places(nodes, (("-a", "b"), ("r", "r"), (0.0, 0.05)))

@@ -43,7 +43,7 @@ def test_legend_and_words_lie_on_no_curve(seed: int, width: float) -> None:
 @pytest.mark.parametrize("size", [(500, 150), (253, 127), (180, 120)])
 def test_words_of_the_explorer_are_inside_and_apart(size: tuple[int, int]) -> None:
     pytest.importorskip("bokeh", reason="bokeh is not installed")
-    from ccd_casadi.explorer import painter
+    from ccd_casadi.extensions.explorer import painter
 
     angle = np.linspace(0.3, 6.0, 200)
     near = [Mark(-0.3 + 0.05 * i, -0.4 - 0.08 * i, f"{78.9 + 9 * i:.3g} Hz", ".") for i in range(4)]

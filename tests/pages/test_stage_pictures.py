@@ -11,9 +11,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
-from ccd_casadi.case_studies.rib_stage.geometry import UPPER, bays, mass
-from ccd_casadi.case_studies.rib_stage.pictures import drawing
 from ccd_casadi.drawing.content import Block, Chapter, Head, Page, Panel, Words
 from ccd_casadi.drawing.paint import block_html, page_html
 from ccd_casadi.drawing.surface import (
@@ -28,6 +25,10 @@ from ccd_casadi.drawing.surface import (
     still,
 )
 from ccd_casadi.drawing.svg import ModeShape, ModeShapes
+from ccd_casadi.extensions.rib_stage.geometry import UPPER, Geometry, PointMass, bays, mass
+from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.model import RibStage
+from ccd_casadi.extensions.rib_stage.pictures import drawing, mode_shapes
 from ccd_casadi.reporting.machine import mode_shape_figure, table_modes
 
 Array = np.ndarray

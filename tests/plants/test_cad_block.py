@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from oracles.block_kernel import CELLS, Block, draw
 from oracles.helpers import few
 
-from ccd_casadi.plants.cad import draw_morph, solid
-from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
+from ccd_casadi.extensions.cad import solid
+from ccd_casadi.extensions.cad.morph import draw_morph
+from ccd_casadi.extensions.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
 from ccd_casadi.support.errors import PlantError
 
 lengths = st.floats(20.0, 200.0)

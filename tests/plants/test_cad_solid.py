@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.plants.cad import draw_morph
-from ccd_casadi.plants.cad.solid import (
+from ccd_casadi.extensions.cad.morph import draw_morph
+from ccd_casadi.extensions.cad.solid import (
     Boundary,
     Piece,
     face_at,

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.imported import main
-from ccd_casadi.plants.imported.interpolation import InterpolatedModes
-from ccd_casadi.plants.imported.matrices import ResultModes, read_modes
-from ccd_casadi.plants.imported.modal_table import read_modal_table
+from ccd_casadi.extensions.imported.command import main
+from ccd_casadi.extensions.imported.interpolation import InterpolatedModes
+from ccd_casadi.extensions.imported.matrices import ResultModes, read_modes
+from ccd_casadi.extensions.imported.modal_table import read_modal_table
 
 DATA = Path(__file__).parents[1] / "data" / "calculix"
 MIDDLE, ENDS = (2, 3, 6, 7), (1, 4, 5, 8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ccd_casadi as ccd
-from ccd_casadi.fixed_structure.measured_loop import winding
+from ccd_casadi.extensions.measured.measured_loop import winding
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.plants.response_table import least_phase
 from ccd_casadi.support.errors import UserError

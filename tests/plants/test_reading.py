@@ -10,9 +10,9 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_matrix
 
+from ccd_casadi.extensions.measured.tuned_plants import read_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
-from ccd_casadi.studies.tuned_plants import read_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import read_mat
 

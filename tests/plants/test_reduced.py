@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.case_studies.rib_stage import reduced
-from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
-from ccd_casadi.case_studies.rib_stage.mesh import COARSE
-from ccd_casadi.case_studies.rib_stage.model import TWENTY, RibStage, faded
-from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
+from ccd_casadi.extensions.rib_stage import reduced
+from ccd_casadi.extensions.rib_stage.geometry import Geometry, PointMass
+from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, faded
+from ccd_casadi.extensions.rib_stage.plant import plant_of_stage
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.support.arrays import Array
 

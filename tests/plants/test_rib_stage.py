@@ -8,29 +8,35 @@ import numpy as np
 import pytest
 from oracles.helpers import HZ
 
-from ccd_casadi.case_studies.rib_stage import (
-    COARSE,
-    FINE,
+from ccd_casadi.extensions.rib_stage.geometry import (
     LOWER,
     UPPER,
     Geometry,
-    Material,
-    MeshOrder,
-    ModeCount,
     PointMass,
-    RibStage,
-    StageError,
-    mode_shapes,
-)
-from ccd_casadi.case_studies.rib_stage.geometry import (
     has_square_symmetry,
     mass_properties,
     rigid_fields,
     rigid_values,
 )
-from ccd_casadi.case_studies.rib_stage.mesh import Mesh, build_mesh, line_nodes, plain
-from ccd_casadi.case_studies.rib_stage.model import discretisation, orthonormal_directions
-from ccd_casadi.case_studies.rib_stage.stage_modes import functionals, groups_of, spectrum
+from ccd_casadi.extensions.rib_stage.mesh import (
+    COARSE,
+    FINE,
+    Mesh,
+    MeshOrder,
+    build_mesh,
+    line_nodes,
+    plain,
+)
+from ccd_casadi.extensions.rib_stage.model import (
+    ModeCount,
+    RibStage,
+    discretisation,
+    orthonormal_directions,
+)
+from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
+from ccd_casadi.extensions.rib_stage.stage_modes import functionals, groups_of, spectrum
+from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.material import Material
 from ccd_casadi.plants.plant import Mechanics
 
 Array = np.ndarray

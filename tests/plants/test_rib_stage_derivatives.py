@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ccd_casadi.case_studies.rib_stage import COARSE, NAMES, Geometry, PointMass, RibStage
-from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import NAMES, Geometry, PointMass
+from ccd_casadi.extensions.rib_stage.mesh import COARSE, MeshOrder
+from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.plants.modal import Suspension, modal_plant
 
 MIDDLE = tuple(1e-3 * np.array([2.0, 5.0, 5.5, 4.0, 12.0, 80.0]))

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from oracles.closed_loops import RATE, Loop, by_ratio, random_loop, recorded
 
-from ccd_casadi.records.findings import findings
-from ccd_casadi.records.plant_estimate import EstimateOptions, PlantEstimate, estimate_plant
-from ccd_casadi.records.time_series import TimeSeries
+from ccd_casadi.extensions.records.findings import findings
+from ccd_casadi.extensions.records.plant_estimate import (
+    EstimateOptions,
+    PlantEstimate,
+    estimate_plant,
+)
+from ccd_casadi.extensions.records.time_series import TimeSeries
 from ccd_casadi.support.errors import UserError
 
 OPTIONS = EstimateOptions()

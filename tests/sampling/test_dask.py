@@ -14,8 +14,8 @@ from oracles.helpers import problem
 from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 
-from ccd_casadi.sampling import cluster as module
-from ccd_casadi.sampling.cluster import Cluster, ClusterOptions
+from ccd_casadi.extensions.cluster import dask_pool as module
+from ccd_casadi.extensions.cluster.dask_pool import Cluster, ClusterOptions
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main

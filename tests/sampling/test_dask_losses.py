@@ -20,7 +20,7 @@ from oracles.helpers import problem
 from test_interruptions import command, rows, started, wait_for_rows
 from test_sampling import table
 
-from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.extensions.cluster.dask_pool import Cluster
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main

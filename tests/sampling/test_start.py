@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 import surrogates
+from ccd_casadi.__main__ import commands
 from ccd_casadi.solve import main
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("numpy", "numba", "casadi", "scipy", "matplotlib", "sklearn", "dask", "control")
-COMMANDS = sorted(
-    path.stem for path in (ROOT / "ccd_casadi").glob("*.py") if "argparse" in path.read_text()
-)
+COMMANDS = sorted(commands())
 
 
 def loaded(words: str) -> list[str]:
@@ -30,7 +29,7 @@ def loaded(words: str) -> list[str]:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("option", ["--help", "--workers=0"])
 def test_options_are_read_before_any_library_is_loaded(command: str, option: str) -> None:
-    assert loaded(f"from ccd_casadi.{command} import main; main(['{option}'])") == []
+    assert loaded(f"from ccd_casadi.__main__ import main; main(['{command}', '{option}'])") == []
 
 
 def test_the_names_of_surrogates_come_when_they_are_used() -> None:

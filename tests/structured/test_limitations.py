@@ -16,19 +16,32 @@ from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import Bounds, Sampling
-from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.gap import main
-from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
-from ccd_casadi.limitations.bound import lower_bound, rules_out, support, support_of, upper_bound
-from ccd_casadi.limitations.limits import Limits, circle, discs, limits_of, ratio, response_of
-from ccd_casadi.limitations.multiplier import MultiplierBasis
-from ccd_casadi.limitations.of_problem import (
+from ccd_casadi.extensions.limitations.bound import (
+    lower_bound,
+    rules_out,
+    support,
+    support_of,
+    upper_bound,
+)
+from ccd_casadi.extensions.limitations.command import main
+from ccd_casadi.extensions.limitations.limits import (
+    Limits,
+    circle,
+    discs,
+    limits_of,
+    ratio,
+    response_of,
+)
+from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
+from ccd_casadi.extensions.limitations.of_problem import (
     gap_of,
     limits_of_problem,
     none_reaches,
     opposite_corners,
 )
+from ccd_casadi.fixed_structure import Bounds, Sampling
+from ccd_casadi.fixed_structure.certificate import judged
+from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz

@@ -10,12 +10,12 @@ from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 from oracles.measured_files import measured
 from scipy.io import savemat
 
+from ccd_casadi.extensions.measured.line_problem import line_problem
+from ccd_casadi.extensions.measured.measured_design import design_on_data
+from ccd_casadi.extensions.measured.measured_loop import judge, winding
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.design import in_problem_units
-from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel
-from ccd_casadi.fixed_structure.measured_design import design_on_data
-from ccd_casadi.fixed_structure.measured_loop import judge, winding
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.support.errors import UserError

@@ -13,7 +13,7 @@ from scipy.io import savemat
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.drawing.paint import escape
-from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
+from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
 from ccd_casadi.inner import main as inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.solve import main as solve

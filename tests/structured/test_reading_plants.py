@@ -10,8 +10,8 @@ from scipy.io import savemat
 from test_tune import judged, response_at
 
 import ccd_casadi as ccd
-from ccd_casadi.fixed_structure.measured_design import design_on_data
-from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
+from ccd_casadi.extensions.measured.measured_design import design_on_data
+from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.measured import MeasuredResponse

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import ccd_casadi as ccd
+from ccd_casadi.extensions.measured.command import main
+from ccd_casadi.extensions.measured.line_problem import LineProblem, line_problem
+from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
+from ccd_casadi.extensions.measured.present_controller import present_loop
+from ccd_casadi.extensions.measured.tuning import Tuned, tune
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.figures import constraints
 from ccd_casadi.fixed_structure.judgement import judge_lines
-from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, RowPlaces
-from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import tustin
 from ccd_casadi.plants.measured import MeasuredResponse
-from ccd_casadi.studies.present_controller import present_loop
-from ccd_casadi.studies.tuning import Tuned, tune
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
-from ccd_casadi.tune import main
 
 RATE = 5000.0
 

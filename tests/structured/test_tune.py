@@ -18,17 +18,17 @@ from test_measured import two_by_two
 
 import ccd_casadi as ccd
 from ccd_casadi import report
+from ccd_casadi.extensions.measured import tuned_plants, tuning
+from ccd_casadi.extensions.measured.command import main
+from ccd_casadi.extensions.measured.line_problem import line_problem
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import judge_lines, judge_loops
-from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
-from ccd_casadi.studies import tuned_plants, tuning
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.interchange import from_control
-from ccd_casadi.tune import main
 from surrogates.lazy_names import from_stub
 
 s = control.tf("s")

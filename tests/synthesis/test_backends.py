@@ -14,11 +14,7 @@ from oracles import lmi
 from oracles.hard_plants import close, from_parts, regularised
 from oracles.helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
 
-from ccd_casadi.cross_check import main
-from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import scale_state_space
-from ccd_casadi.studies.backends import (
+from ccd_casadi.extensions.cross_check.backends import (
     SOLVERS,
     BackendOptions,
     BackendResult,
@@ -27,6 +23,10 @@ from ccd_casadi.studies.backends import (
     synthesise_with,
     verdicts,
 )
+from ccd_casadi.extensions.cross_check.command import main
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.support.errors import MissingPackage, require
 
 ROOT = Path(__file__).resolve().parents[2]

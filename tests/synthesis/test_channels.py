@@ -10,7 +10,8 @@ from oracles.draws import few
 from oracles.helpers import HZ
 from scipy.stats import ortho_group
 
-from ccd_casadi.case_studies.rib_stage import COARSE, RibStage
+from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.kernels import certified_design as design
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
 from ccd_casadi.plants.scaling import find_channels, scale_plant

@@ -15,6 +15,7 @@ from scipy.linalg import schur
 
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.extensions.cross_check.backends import balance, mixed_sensitivity
 from ccd_casadi.inner_problem.problem import true_inner
 from ccd_casadi.kernels.certified_design import design, judge
 from ccd_casadi.kernels.linear_algebra import stable_subspace
@@ -25,7 +26,6 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
-from ccd_casadi.studies.backends import balance, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -142,7 +142,7 @@ def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: in
 
 
 def test_gamma_opt_is_that_of_sb10ad() -> None:
-    from ccd_casadi.studies.backends import solve_slicot
+    from ccd_casadi.extensions.cross_check.backends import solve_slicot
 
     compared = 0
     for seed in range(6):

@@ -7,8 +7,8 @@ import pytest
 from oracles import lmi
 from oracles.hard_plants import HARD, close, regularised
 
+from ccd_casadi.extensions.cross_check.backends import solve_slicot
 from ccd_casadi.lti.norms import gains
-from ccd_casadi.studies.backends import solve_slicot
 from ccd_casadi.support.worker_process import Runner
 
 pytest.importorskip("cvxpy")

@@ -28,10 +28,10 @@ from oracles.helpers import (
     two_mass_model,
 )
 
+from ccd_casadi.extensions.cross_check.backends import synthesise_with
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.studies.backends import synthesise_with
 from ccd_casadi.synthesis.synthesis import Design, Outcome, sweep, synthesise
 from ccd_casadi.synthesis.weights import Weights
 

@@ -11,7 +11,7 @@ from oracles.helpers import few
 from scipy.io import savemat
 from scipy.linalg import expm
 
-from ccd_casadi.studies.tuned_plants import read_plant
+from ccd_casadi.extensions.measured.tuned_plants import read_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control, read_mat
 from ccd_casadi.synthesis.time_base import appears_discrete

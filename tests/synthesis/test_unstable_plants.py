@@ -13,6 +13,7 @@ from oracles.hard_plants import close
 from oracles.helpers import control_weights, few, state_response, to_control
 from scipy.linalg import block_diag
 
+from ccd_casadi.extensions.cross_check.backends import balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.kernels.certified_design import design
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.riccati import lqr_hamiltonian
@@ -23,7 +24,6 @@ from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant, wi
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledChannel, ScaledPlant, scale_state_space
-from ccd_casadi.studies.backends import balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 from ccd_casadi.synthesis.weights import Weights

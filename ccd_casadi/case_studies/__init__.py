@@ -1,1 +1,0 @@
-"""Case studies: plants of their own, found by the registry as any other package's are."""

@@ -1,0 +1,229 @@
+"""A stage from CAD as the case file names it: the options of `cad_stage`, and its plant."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.drawing.content import Figure
+from ccd_casadi.drawing.surface import surface_figure
+from ccd_casadi.drawing.svg import ModeShapes
+from ccd_casadi.extensions.cad.elastic_body import Body, mode_shapes, reduced, surface
+from ccd_casadi.extensions.cad.morph import Morph, read_morph
+from ccd_casadi.extensions.cad.solid import volumes
+from ccd_casadi.plants.differenced import remembered
+from ccd_casadi.plants.fixed_parameters import with_fixed
+from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.registry import Model
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.errors import PlantError, require
+
+MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
+
+
+def cad_stage(
+    names: Sequence[str],
+    morph: str = "",
+    forces: Sequence[str] = (),
+    sensors: Sequence[str] = (),
+    rigid: Sequence[str] = MOTIONS,
+    held: Sequence[str] = (),
+    modes: int = 10,
+    zeta: float = 0.01,
+    young: float = 68.9e9,
+    poisson: float = 0.33,
+    density: float = 2700.0,
+) -> Plant:
+    """Make the plant of a stage whose mesh `draw_morph` wrote; its hardware cost is its mass in kg.
+
+    Its reference is the same stage with twice as many modes.
+
+    Parameters
+    ----------
+    names : sequence of str (n,)
+        θ, those of the mesh in any order.
+    morph : str
+        File of the mesh.
+    forces, sensors : sequences of str
+        "FACE:x", y or z: a force spread evenly over a named face, the mean displacement of one;
+        without, all faces along z.
+    rigid : sequence of str
+        Rigid-body motions in the model, of x, y, z, rx, ry, rz.
+    held : sequence of str
+        Faces that do not move; a stage without floats.
+    modes : int
+        Flexible modes.
+    zeta : float
+        Their damping ratio.
+    young, poisson, density : float
+        Pa, 1, kg/m³.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        A name of the case is not one of the mesh; the message has the remedy.
+    """
+    if not morph:
+        raise PlantError('cad_stage needs morph = "stage.npz", relative to the case file')
+    require("skfem", "cad")
+    mesh, file = read_morph(morph), Path(morph).name
+    if sorted(names) != sorted(mesh.names):
+        raise PlantError(
+            f"{file} has the parameters {', '.join(mesh.names)}, the case {', '.join(names)}; "
+            "make them agree"
+        )
+    every = tuple(f"{face}:z" for face in mesh.faces)
+    stage = CadStage(
+        morph=mesh,
+        material=Material(young, poisson, density),
+        forces=_ports("forces", forces or every, mesh),
+        sensors=_ports("sensors", sensors or every, mesh),
+        rigid=tuple(_one_of("rigid", name, MOTIONS) for name in rigid),
+        held=tuple(_one_of("held", name, tuple(mesh.faces)) for name in held),
+        modes=modes,
+        damping_ratio=zeta,
+    )
+    return plant_of_stage(stage, names, file)
+
+
+Port = tuple[str, int]  # a face and an axis
+
+
+@dataclass(frozen=True)
+class CadStage:
+    """A morphed mesh with its material, forces, sensors and the modes of its model."""
+
+    morph: Morph
+    material: Material
+    forces: tuple[Port, ...]
+    sensors: tuple[Port, ...]
+    rigid: tuple[str, ...] = MOTIONS
+    held: tuple[str, ...] = ()
+    modes: int = 10
+    damping_ratio: float = 0.01
+
+    def mechanics(self, theta: Sequence[float], derivatives: bool = True) -> Mechanics:
+        """Rigid-body motions, then flexible modes by frequency; SI. θ in the morph's order."""
+        ports = tuple(dict.fromkeys((*self.forces, *self.sensors)))
+        body = Body(self.morph.points(theta), self.morph.tets, self.material)
+        velocities = self.morph.velocities(theta)[: None if derivatives else 0]
+        nodes = len(body.places)
+        F = np.zeros((3 * nodes, len(ports)))
+        dF = np.zeros((len(velocities), 3 * nodes, len(ports)))
+        for k, (face, axis) in enumerate(ports):
+            block = slice(axis * nodes, (axis + 1) * nodes)
+            F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
+        found = reduced(body, velocities, F, dF, self.modes, self._held(body))
+        count = found.M.shape[0] - self.modes
+        rows = [MOTIONS.index(name) for name in self.rigid] if count else []
+        rows += range(count, count + self.modes)
+        pick = np.ix_(rows, rows)
+        drive, read = (
+            [ports.index(port) for port in group] for group in (self.forces, self.sensors)
+        )
+        F, dF = found.F[rows], found.dF[:, rows]
+        dM, dK = (item[:, rows][:, :, rows] for item in (found.dM, found.dK))
+        n = len(rows)
+        return Mechanics(
+            M=found.M[pick], D=np.zeros((n, n)), K=found.K[pick],
+            B=F[:, drive], C=F[:, read].T, damping_ratio=self.damping_ratio,
+            derivatives=(
+                dM, np.zeros_like(dM), dK, dF[:, :, drive], dF[:, :, read].transpose(0, 2, 1),
+            ),
+        )  # fmt: skip
+
+    def _held(self, body: Body) -> np.ndarray:
+        """(3N,) the unknowns that are zero."""
+        held = np.zeros((3, len(body.places)), dtype=bool)
+        for face in self.held:
+            held[:, body.on(self.morph.faces[face])] = True
+        return held.ravel()
+
+    def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
+        """The lowest flexible modes on the surface."""
+        body = Body(self.morph.points(theta), self.morph.tets, self.material)
+        return mode_shapes(body, count, self._held(body))
+
+    def drawing(self, thetas: Mapping[str, Sequence[float]]) -> Figure:
+        """Stages by name; θ in the morph's order."""
+        used, faces = surface(self.morph.tets)
+        surfaces = {name: self.morph.points(theta)[used] for name, theta in thetas.items()}
+        return surface_figure(surfaces, faces, [self.mass(theta) for theta in thetas.values()])
+
+    def mass(self, theta: Sequence[float] | Array) -> float:
+        """In kg."""
+        return float(
+            self.material.density * volumes(self.morph.points(theta), self.morph.tets).sum()
+        )
+
+    def mass_slope(self, theta: Sequence[float] | Array) -> Array:
+        """∂mass/∂θ, (p,)."""
+        corners = self.morph.points(theta)[self.morph.tets]
+        moved = self.morph.velocities(theta)[:, self.morph.tets]
+        edges, steps = (part[..., 1:, :] - part[..., :1, :] for part in (corners, moved))
+        growth = np.einsum("tij,ptji->pt", np.linalg.inv(edges), steps)
+        return self.material.density * growth @ np.linalg.det(edges) / 6.0
+
+
+def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh") -> Plant:
+    """The stage as the plant that the design loop asks for, θ in the order of `names`."""
+    morph = stage.morph
+    middle, half = 0.5 * (morph.lower + morph.upper), 0.5 * (morph.upper - morph.lower)
+
+    # in units of the box, so that CasADi's differences of the slope have a fitting step
+    mass = VectorCallback(
+        "mass", len(names), 1,
+        lambda unit: np.array([stage.mass(middle + half * unit)]),
+        lambda unit: (half * stage.mass_slope(middle + half * unit))[None],
+        hessians=True,
+    )  # fmt: skip
+    theta, finer = ca.MX.sym("theta", len(names)), replace(stage, modes=2 * stage.modes)
+    notes = (
+        f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
+        f"{morph.error:.1e} m of the drawing where that was checked; its first "
+        f"{stage.modes} flexible modes",
+    )
+    plant = Plant(
+        names=morph.names,
+        constraint_names=(),
+        evaluate=remembered(stage.mechanics),
+        hardware=ca.Function("hardware", [theta], [mass((theta - middle) / half), ca.MX(0, 1)]),
+        outputs=len(stage.sensors),
+        inputs=len(stage.forces),
+        references={"twice as many modes": remembered(finer.mechanics, False)},
+        exact_hessian=False,
+        values=remembered(stage.mechanics, False),
+        notes=lambda theta: notes,
+        domain=(morph.lower, morph.upper),
+        shapes=stage.shapes,
+        drawing=stage.drawing,
+        callback=mass,
+    )
+    return with_fixed(plant, {}, names)
+
+
+def _ports(key: str, texts: Sequence[str], morph: Morph) -> tuple[Port, ...]:
+    found = []
+    for text in texts:
+        face, _, axis = str(text).rpartition(":")
+        if axis not in ("x", "y", "z"):
+            raise PlantError(f'{key}: {text!r} has no direction; write "FACE:z", or x or y')
+        found.append((_one_of(key, face, tuple(morph.faces)), "xyz".index(axis)))
+    return tuple(found)
+
+
+def _one_of(key: str, name: str, known: tuple[str, ...]) -> str:
+    if name not in known:
+        raise PlantError(f"{key}: {name!r} is none of {', '.join(known)}; correct it")
+    return name
+
+
+MODEL = Model(cad_stage, data="morph", annotated=True)

@@ -1,0 +1,410 @@
+"""One browser page: sliders, figures and buttons over a session; an answer to every drag."""
+
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.events import DocumentReady
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, CustomJS, Range1d
+from bokeh.models.widgets.buttons import Button
+from bokeh.models.widgets.markups import Div
+
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.drawing.paint import escape
+from ccd_casadi.extensions.explorer import ASSETS
+from ccd_casadi.extensions.explorer.controls import (
+    Controls,
+    MapFigure,
+    PlacesFigure,
+    landscape_of,
+    moves,
+    run_surrogate,
+    steepest_axes,
+)
+from ccd_casadi.extensions.explorer.curves import (
+    EMPTY,
+    FIGURES,
+    LOOKS,
+    OVER_HZ,
+    Drawn,
+    curves_of,
+    drawn,
+    machine_html,
+    move_words,
+    sampled_of,
+    standing_html,
+    with_sampled,
+)
+from ccd_casadi.extensions.explorer.designs import Designed, How, Knobs, Look, anchored, designed
+from ccd_casadi.extensions.explorer.known_plant import Background, Solve
+from ccd_casadi.extensions.explorer.painter import (
+    ON_DARK,
+    Message,
+    PanelFigure,
+    cursor,
+    legend_html,
+)
+from ccd_casadi.extensions.explorer.pins import Kept, Pins
+from ccd_casadi.extensions.explorer.session import Session, searched_exactly
+from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import ExitCode
+from ccd_casadi.support.text import package_text
+
+TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
+WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
+LINES = 40  # of a solve's output
+BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
+SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
+
+
+class ExplorerPage:
+    """The widgets of one document, and what happens when one is moved."""
+
+    def __init__(
+        self, document: Document, session: Session, background: Background,
+        of_solves: Sequence[str], dark: bool, kept: Kept,
+    ) -> None:  # fmt: skip
+        self.document, self.session, self.background = document, session, background
+        self._of_solves, self._dark, self._kept = of_solves, dark, kept  # options of solves
+        parameters = session.case.theta
+        hz, line = Range1d(start=0.1, end=1e4), cursor()
+        self.figures = [
+            PanelFigure(name, heading, dark, log_x=log_x, log_y=log_y,
+                        x_range=hz if name in OVER_HZ else None,
+                        cursor=line if name in OVER_HZ else None, whole_circles=name == "nyquist")
+            for name, (heading, log_x, log_y) in FIGURES.items()
+        ]  # fmt: skip
+        self.controls = Controls(session.case, session.start, self.moved, dark)
+        if kept.knobs is not None:
+            self.controls.put(kept.knobs)
+        self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
+        self.map = MapFigure(parameters, self.draw_map, dark)
+        run, problem = session.run, session.problems.at(session.start)
+        self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
+        self._surrogate = None if run is None else run_surrogate(run.folder)
+        self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
+        self._of_search = False
+        self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
+        self._seen: list[Look] = []  # to be written into the store
+        self._newest: Knobs | None = None  # to be searched, while a search is under way
+        self.now: Drawn | None = None
+        truths = read_truths(session.store.path, problem)
+        known = known_bandwidths(problem, self._surrogate, truths)
+        self.map.choose(steepest_axes(known, problem.lower, problem.upper))
+        self.solve: Solve | None = None
+        self._output: list[str] = []
+        self._solved = session.folder
+        # what was answered last: a watch in the browser stops when this has been drawn
+        nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
+        self.answer = ColumnDataSource(nothing, name="answer")
+        self._message, self._serial = Message(), 0
+        self._message.applied_in(document)
+        self.pins.table.tags = [self.answer, self._message]  # so that they are sent
+        self.note, self.output = Div(name="note"), Div(name="output")
+        self.modes = Div(stylesheets=[WIDE])
+        self.design = _button("Design sections here", "design", self.design_structured)
+        self._designs, self._began = False, session.kappa is not None
+        self.solve_button = _button("Solve from here", "solve", self.start_solve)
+        self.stop = _button("Stop the solve", "stop", self.stop_solve)
+        self.stop.disabled = True
+        self._place()
+        self.moved(True)
+
+    def _place(self) -> None:
+        buttons = [
+            _button("Pin this design", "pin", self.pin), _button("Go to selected", "go", self.go),
+            _button("Unpin selected", "unpin", self.pins.drop), self.design, self.solve_button,
+            self.stop, _button("Save as case", "save", self.write_case),
+        ]  # fmt: skip
+        fill: Any = "stretch_width"
+        wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
+        roots: dict[str, list[Any]] = {
+            "controls": self.controls.all(),
+            "note_place": [self.note, self.output],
+            "modes": [self.modes],
+            "buttons_place": [wrapped],
+            "pins_place": [self.pins.table],
+            "map_place": [self.map.root()],
+        } | {f"{made.name}_place": [made.figure] for made in self.figures}
+        roots |= {f"{places.name}_place": [places.figure] for places in self.places}
+        for name, parts in roots.items():
+            for part in parts:
+                if part.sizing_mode is None:
+                    part.sizing_mode = fill
+            self.document.add_root(column(*parts, name=name, sizing_mode=fill))
+        names = {made.name: made.heading for made in self.figures} | {"landscape": "Landscape"}
+        label = CustomJS(args={"names": names}, code=package_text(f"{ASSETS}/label.js"))
+        self.document.js_on_event(DocumentReady, label)
+
+    # drags
+
+    def _placed(self, theta: Array) -> None:
+        """A place was dragged: the sliders move to its θ, within the box."""
+        low, high = zip(*((p.lower, p.upper) for p in self.session.case.theta), strict=True)
+        inside = tuple(np.clip(theta, low, high).tolist())
+        self.controls.put(replace(self.controls.knobs(), theta=inside))
+        self.moved(True)
+
+    def moved(self, let_go: bool, of_search: bool = False) -> None:
+        """A slider moved: answer soon, once for all that moved meanwhile.
+
+        `of_search`: it is one that a search alone answers.
+        """
+        self._let_go, self._of_search = self._let_go or let_go, self._of_search or of_search
+        self._moves += 1
+        if not self._scheduled:
+            self._scheduled = True
+            self._answer_after(self._moves)
+
+    def _answer_after(self, moves: int) -> None:
+        # While a slow design was made, moves queued up that come now one by one: to answer each
+        # would leave the page further and further behind the slider.
+        def still() -> None:
+            if self._moves == moves:
+                self._answer()
+            else:
+                self._answer_after(self._moves)
+
+        self.document.add_timeout_callback(still, TOGETHER)
+
+    def improved(self) -> None:
+        """The model of a slow plant was made anew: draw what is not the plant's own on it."""
+        if self.now is not None and not self.now.look.elements.exact:
+            self.moved(False)
+
+    def _answer(self) -> None:
+        self._scheduled, let_go, self._let_go = False, self._let_go, False
+        search = self._of_search and self.session.quick
+        self._of_search = False
+        self._kept.knobs = knobs = self.controls.knobs()
+        structured = knobs.structured
+        self.design.disabled = self._designs or not structured
+        full = (let_go or search or bool(self.controls.always.active)) and not structured
+        behind = full and self.session.known is not None
+        try:
+            here = full and not behind
+            look = self.session.full(knobs) if here else self.session.live(knobs)
+        except UserError as error:
+            self._complain(str(error))
+            return
+        self.note.text = ""
+        self.show(look)
+        if behind:
+            self._search_behind(knobs)
+        if let_go:
+            self.settle()
+        if structured and not self._began and self.session.known is None:
+            self.design_structured()  # no page stays without a controller
+
+    def _complain(self, words: str) -> None:
+        self.note.text = f'<p class="refused">{escape(words)}</p>'
+
+    def show(self, look: Look) -> None:
+        """Draw a design, and say that this is the answer."""
+        sampled = sampled_of(look) if look.knobs.sampled else None
+        look = with_sampled(look, sampled)
+        curves = curves_of(look)
+        self.now = now = drawn(look, curves, sampled)
+        session = self.session
+        self._serial += 1
+        answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
+        pinned = self.pins.pinned
+        beside = (pinned[-1][0], pinned[-1][1].look.bandwidth_hz) if pinned else self._first
+        words = {
+            "verdict": standing_html(look, curves, sampled, beside),
+            "machine": machine_html(look, session.start.theta, session.reference),
+        } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY))
+             for made in self.figures}  # fmt: skip
+        words["say_move"] = move_words(curves)
+        colour, dash = LOOKS[look.standing]
+        colour = ON_DARK.get(colour, colour) if self._dark else colour
+        frame = look.how is not How.PRESENT and curves is not None
+        changes = [change for made in self.figures for change in
+                   made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
+        changes += [made.marks(look.theta) for made in self.places]
+        changes += [self.map.mark(look.theta), (self.answer, {"data": answer})]
+        self._message.send(words, changes)
+        self._seen.append(look)
+        if self._first is None and look.how is not How.PRESENT:
+            self._first = "the first one", look.bandwidth_hz
+
+    def settle(self) -> None:
+        """When the answer is on its way: write what was looked at, draw the landscape."""
+        self.document.add_next_tick_callback(self._settled)
+
+    def _settled(self) -> None:
+        seen, self._seen = self._seen, []
+        self.session.keep(seen)
+        self.draw_map()
+
+    def draw_map(self) -> None:
+        """The landscape at the present settings."""
+        if self.now is None:
+            return
+        run, store = self.session.run, self.session.store.path
+        made_for = None if run is None else run.problem
+        look = self.now.look
+        self.map.show(
+            *landscape_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
+        )
+        here, new = self.map.mark(look.theta)
+        here.update(**new)
+
+    # the background
+
+    def _then(self, action: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The action in this document's own turn, whatever thread calls."""
+
+        def later(found: Any) -> None:
+            if self._open:
+                self.document.add_next_tick_callback(lambda: action(found))
+
+        return later
+
+    def _search_behind(self, knobs: Knobs) -> None:
+        """The exact elements and the full search of the newest place, one at a time."""
+        busy, self._newest = self._newest is not None, knobs
+        self.note.text = "<p>solving the model and searching at this θ …</p>"
+        if not busy:
+            task = (self.session.problems.at(knobs), knobs)
+            search = self.background.ask(searched_exactly, task)
+            self.background.answer(search, self._then(self._searched), self._then(self._failed))
+
+    def _searched(self, found: tuple[Look, str]) -> None:
+        look, modes = found
+        newest, self._newest = self._newest, None
+        known = self.session.known
+        assert known is not None
+        self.note.text = ""
+        count = len(known.exact)
+        off = self.session.took(look)
+        if off is not None:
+            words = f"the frequencies drawn while you dragged were off by {100.0 * off:.2g} % here"
+            self.note.text = f"<p>{words}</p>"
+        if len(known.exact) > count:
+            self.background.renew(known, self._then(lambda _: self.improved()))
+        self.modes.text = modes
+        if newest in (None, look.knobs) and self.controls.knobs() == look.knobs:
+            self.show(look)
+        else:
+            self._seen.append(look)
+        if newest is not None and newest != look.knobs:
+            self._search_behind(newest)
+        self.settle()
+
+    def _failed(self, error: BaseException) -> None:
+        self._newest, self._designs = None, False
+        self._complain(str(error))
+
+    def design_structured(self) -> None:
+        """A controller of fixed structure at this θ."""
+        knobs = self.controls.knobs()
+        problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
+        self.waits_for(self.background.ask(designed, (problem, knobs), self.told))
+
+    def waits_for(self, design: Future) -> None:
+        """A design is under way, which this page shows once it ends."""
+        self.design.disabled = self._designs = self._began = True
+        self._designing("it takes seconds")
+        self.background.answer(design, self._then(self._designed), self._then(self._failed))
+
+    def told(self, words: str) -> None:
+        """How far a design is, in any thread."""
+        self._then(self._designing)(words)
+
+    def _designing(self, words: str) -> None:
+        if self._designs:  # not of one that has ended
+            self.note.text = f"<p>designing a controller at this θ: {escape(words)} …</p>"
+
+    def _designed(self, found: Designed) -> None:
+        self.design.disabled, self._designs, self.note.text = False, False, ""
+        look = self.session.took_designed(found)
+        if look is None:
+            self._complain(found.words)
+        elif found.knobs == self.controls.knobs():
+            self.show(look)
+            self.settle()
+        else:  # the sliders moved meanwhile: it is judged where they are
+            self.moved(True)
+
+    # pins, files, solves
+
+    def pin(self) -> None:
+        """Keep the present design beside those to come."""
+        if self.now is not None:
+            self.pins.add(self.now)
+
+    def go(self) -> None:
+        """Move the sliders to the selected pin."""
+        pinned = self.pins.selected()
+        if pinned is not None:
+            self.controls.put(pinned.look.knobs)
+            self.moved(True)
+
+    def write_case(self) -> None:
+        """Save as case."""
+        place = self.session.save(self.controls.knobs())
+        self.output.text = f"<p>saved {escape(str(place))}</p>"
+
+    def start_solve(self) -> None:
+        """Solve from here, in the background."""
+        folder, case = self.session.folder_for_solve(self.controls.knobs())
+        self._output, self._solved = [f"solving into {folder}"], folder
+        self.solve_button.disabled, self.stop.disabled = True, False
+        said, ended = self._then(self._said), self._then(self._ended)
+        self.solve = Solve(case, folder, self._of_solves, said, ended)
+        self._said("")
+
+    def stop_solve(self) -> None:
+        """As Ctrl-C."""
+        if self.solve is not None:
+            self.solve.stop()
+
+    def _said(self, line: str) -> None:
+        if BAR.search(line) and BAR.search(self._output[-1]):
+            self._output[-1] = line
+        elif line:
+            self._output.append(line)
+        shown = "\n".join(self._output[:1] + self._output[1:][-LINES:])
+        self.output.text = f"<pre>{escape(shown)}</pre>"
+
+    def _ended(self, code: int) -> None:
+        self.solve_button.disabled, self.stop.disabled = False, True
+        known = {exit_code.value: exit_code.words for exit_code in ExitCode}
+        words = known.get(code, f"exit code {code}")
+        self._said(f"the solve ended: {words}")
+        if code in (0, 4):
+            self._go_to_solved()
+        if (self._solved / "report.html").exists():
+            place = f"{SOLVED}/{self._solved.name}/report.html"
+            self.output.text += f'<p><a href="{place}" target="_blank">the report of it</a></p>'
+
+    def _go_to_solved(self) -> None:
+        """Its design on the sliders, its surrogate in the landscape."""
+        try:
+            run = read_run(self._solved)
+        except UserError:
+            return  # what it ended with is no certified design
+        self.session.run, self._surrogate = run, run_surrogate(run.folder)
+        self.controls.put(replace(self.controls.knobs(), theta=run.theta))
+        self.moved(True)
+
+    def close(self) -> None:
+        """The page was closed: a solve goes on only while somebody sees it."""
+        self._open = False
+        self.stop_solve()
+        self.session.keep(self._seen)
+        self._seen = []
+
+
+def _button(label: str, name: str, action: Callable[[], None]) -> Button:
+    made = Button(label=label, name=name, width=132)
+    made.on_click(action)
+    return made

@@ -1,0 +1,212 @@
+"""What the explorer knows while it runs: the case, the store of its looks, pins, files written."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.tables import Case
+from ccd_casadi.extensions.explorer.curves import surface_modes_html
+from ccd_casadi.extensions.explorer.designs import (
+    Designed,
+    Elements,
+    How,
+    Knobs,
+    Look,
+    Problems,
+    anchored,
+    case_at,
+    elements_at,
+    judged_look,
+    knobs_of,
+    present,
+    searched,
+    without_controller,
+)
+from ccd_casadi.extensions.explorer.known_plant import KnownPlant
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.reporting.machine import lumped
+from ccd_casadi.sampling.inner_samples import sample_of
+from ccd_casadi.sampling.sample_keys import hashes_of, problem_hash, sample_key
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.units import unit_of
+from ccd_casadi.support.terminal import Tell
+from surrogates.files import write_whole
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """Times that decide what a drag waits for.
+
+    Attributes
+    ----------
+    quick : float
+        Of a full search that a drag of S_max waits for, s.
+    slow : float
+        Of the plant at a θ from which on it is solved in the background, s.
+    """
+
+    quick: float = 0.4
+    slow: float = 0.1
+
+
+class Session:
+    """One case in one folder: `live` answers at once, `full` takes the time of the inner search.
+
+    Parameters
+    ----------
+    case : Case
+    folder : Path
+    run : FinishedRun, optional
+        Where the session starts.
+    """
+
+    def __init__(self, case: Case, folder: Path, run: FinishedRun | None = None) -> None:
+        self.case, self.folder, self.run = case, folder, run
+        self.problems = Problems(case)
+        self.start = knobs_of(case)
+        if run is not None:
+            self.start = replace(self.start, theta=run.theta)
+        # of a fixed structure: the last controller, and the problem that it was designed for
+        self.kappa = None if run is None else run.kappa
+        self.designed_for = None if self.kappa is None or run is None else run.problem
+        problem = self.problems.at(self.start)
+        began = perf_counter()
+        first = elements_at(problem, self.start.theta)
+        self.slow = perf_counter() - began > SessionOptions.slow
+        self.search_seconds = np.inf  # of the last full search
+        found = lumped(first.system)
+        self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
+        self.known: KnownPlant | None = None
+        if self.slow:
+            self.known = KnownPlant(plant_of(problem), problem.lower, problem.upper)
+            self.known.learn(self.start.theta, first.system)
+        inner = problem.inner
+        # until something was searched: the middle of the ranges
+        self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
+        self.store = SampleStore(folder / "samples.sqlite")  # last: what is refused opens none
+
+    @property
+    def undesigned(self) -> bool:
+        """Whether a controller has to be designed before anything is shown, which takes seconds."""
+        return self.start.structured and self.kappa is None and self.known is None
+
+    def elements(self, problem: CoDesignProblem, theta: tuple[float, ...]) -> Elements:
+        """The plant's matrices at θ as fast as one drags."""
+        return elements_at(problem, theta) if self.known is None else self.known.at(theta)
+
+    def live(self, knobs: Knobs) -> Look:
+        """One certified synthesis at the weights of the last search.
+
+        Of a fixed structure: the last controller, judged at this θ.
+        """
+        problem = self.problems.at(knobs)
+        if kind_of(problem).as_designed:
+            return self._held(problem, knobs)
+        elements = self.elements(problem, knobs.theta)
+        return present(problem, knobs, elements, (self.point[0], self.point[1]))
+
+    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> Look:
+        problem = anchored(problem, self.designed_for)
+        if self.kappa is None:
+            elements = elements_at(problem, knobs.theta)
+            words = "no controller yet: design one here"
+            return without_controller(problem, knobs, elements, How.STRUCTURED, words)
+        return judged_look(problem, knobs, self.kappa, How.HELD)
+
+    def took_designed(self, found: Designed) -> Look | None:
+        """A design of a fixed structure ended: into the store, and the controller of looks to come.
+
+        None where no controller was found.
+        """
+        key = problem_hash(found.problem.identity())
+        self.store.put_problem(key, found.problem.identity())
+        self.store.put_unit(found.rows, found.unit, key)
+        if found.kappa is None:
+            return None
+        self.kappa, self.designed_for = found.kappa, found.problem
+        return judged_look(found.problem, found.knobs, found.kappa, How.STRUCTURED)
+
+    def full(self, knobs: Knobs) -> Look:
+        """The inner problem at θ on the model itself."""
+        problem = self.problems.at(knobs)
+        look = searched(problem, knobs, elements_at(problem, knobs.theta))
+        self.search_seconds = look.seconds
+        self.took(look)
+        return look
+
+    @property
+    def quick(self) -> bool:
+        """Whether a full search is over within a drag's patience."""
+        return self.known is None and self.search_seconds < SessionOptions.quick
+
+    def took(self, look: Look) -> float | None:
+        """A full search ended: its weights are those of the syntheses to come.
+
+        How far off the model of a slow plant was at this θ, relative; None where there was none.
+        """
+        self.point = (look.figures.omega_S, look.figures.omega_T)
+        if self.known is None or not look.elements.exact:
+            return None
+        return self.known.learn(look.theta, look.elements.system)
+
+    def keep(self, looks: Sequence[Look]) -> None:
+        """Write designs that were looked at into the store: a search with every synthesis of it.
+
+        What was made on other matrices than the model's is kept as another problem's.
+        """
+        for look in looks:
+            problem = look.problem.identity()
+            if look.how is How.STRUCTURED:
+                continue  # with its unit, or there is none
+            if look.kappa is not None:
+                problem = problem | {"held": [float(v) for v in look.kappa]}
+            if not look.elements.exact:
+                problem = problem | {"elements": look.elements.words}
+            key = problem_hash(problem)
+            self.store.put_problem(key, problem)
+            if look.result is None:
+                f = look.figures
+                own = sample_key(key, look.theta, f.omega_S, f.omega_T)
+                self.store.put([sample_of(own, look.theta, f, look.seconds)], key)
+                continue
+            each = look.seconds / max(look.result.syntheses, 1)
+            rows, payload = unit_of(key, look.theta, look.result, look.problem.inner, each)
+            optimum = look.result.optimum
+            if optimum is not None and optimum.to_theta.shape[1] != len(look.theta):
+                self.store.put(rows, key)  # of matrices without derivatives: no sample of ω_b*(θ)
+                continue
+            inner = hashes_of(look.problem)[1]
+            unit = (sample_key(inner, look.theta), inner, look.theta, payload)
+            self.store.put_unit(rows, unit, key)
+
+    def save(self, knobs: Knobs) -> Path:
+        """The sliders as a case file, beside the store, under a number of its own."""
+        place = self._numbered("explored", ".toml")
+        write_whole(place, case_to_toml(case_at(self.case, knobs)))
+        return place
+
+    def folder_for_solve(self, knobs: Knobs) -> tuple[Path, Path]:
+        """A new folder for a solve from the sliders' θ, and its case file."""
+        folder = self._numbered("solved", "")
+        folder.mkdir()
+        place = folder / "from_here.toml"
+        write_whole(place, case_to_toml(case_at(self.case, knobs)))
+        return folder, place
+
+    def _numbered(self, name: str, suffix: str) -> Path:
+        places = (self.folder / f"{name}_{number}{suffix}" for number in count(1))
+        return next(place for place in places if not place.exists())
+
+
+def searched_exactly(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> tuple[Look, str]:
+    """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
+    problem, knobs = task
+    elements = elements_at(problem, knobs.theta)
+    return searched(problem, knobs, elements), surface_modes_html(problem, knobs.theta)

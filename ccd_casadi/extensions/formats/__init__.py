@@ -1,0 +1,11 @@
+"""Formats of a deployed controller beside C: structured text, and an FMU."""
+
+from ccd_casadi.support.extensions import Extension
+
+TEMPLATES = "extensions/formats/templates"
+EXTENSION = Extension(
+    functions={
+        "fmu": "ccd_casadi.extensions.formats.fmu:write_fmu",
+        "structured_text": "ccd_casadi.extensions.formats.structured_text:structured_text",
+    }
+)

@@ -1,0 +1,115 @@
+"""What an estimate shows and what is missing in it, in words with frequencies."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.extensions.records.plant_estimate import EstimateOptions, PlantEstimate
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.text import counted
+
+
+@dataclass(frozen=True)
+class FindingOptions:
+    """Limits beyond which something is named.
+
+    Attributes
+    ----------
+    leakage : float
+        Share of the power that the ends of the record explain.
+    most : int
+        Ranges of frequency that are named.
+    joined : float
+        Ratio of two lines below which they are of one range.
+    """
+
+    leakage: float = 0.9
+    most: int = 4
+    joined: float = 1.1
+
+
+def ranges(hz: Array, chosen: np.ndarray, options: FindingOptions = FindingOptions()) -> str:
+    """Write the ranges of some lines.
+
+    Parameters
+    ----------
+    hz, chosen : array (k,), bool array (k,)
+    options : FindingOptions
+
+    Returns
+    -------
+    str
+        Empty where no line is chosen.
+    """
+    parts = list(_runs(hz[chosen], options.joined))
+    words = [f"{a:.4g} Hz" if a == b else f"{a:.4g} to {b:.4g} Hz" for a, b in parts]
+    more = [f"{len(words) - options.most} more ranges"] if len(words) > options.most else []
+    return ", ".join(words[: options.most] + more)
+
+
+def _runs(hz: Array, joined: float) -> Iterator[tuple[float, float]]:
+    start = 0
+    for i in range(1, len(hz) + 1):
+        if i == len(hz) or hz[i] > joined * hz[i - 1]:
+            yield float(hz[start]), float(hz[i - 1])
+            start = i
+
+
+def findings(
+    found: PlantEstimate, period: float, estimate: EstimateOptions,
+    options: FindingOptions = FindingOptions(),
+) -> list[tuple[str, str]]:  # fmt: skip
+    """List what is to be known of an estimate.
+
+    Parameters
+    ----------
+    found : PlantEstimate
+        On all its lines.
+    period : float
+        s, of the samples.
+    estimate, options : EstimateOptions, FindingOptions
+
+    Returns
+    -------
+    list of (subject, words)
+    """
+    used = found.used
+    if not len(used.hz):
+        return [("missing", "every line: the spread is above |G|; inject more force, or longer")]
+    ratio = used.spread / np.abs(used.G)
+    percent = 100.0 * estimate.confidence
+    worst = int(ratio.argmax())
+    rows = [
+        ("response", f"{counted(len(used.hz), 'line')} from {used.hz[0]:.4g} to "
+                     f"{used.hz[-1]:.4g} Hz, hold and delay in it"),
+        ("spread", f"{percent:g} % confidence at each line: {100.0 * np.median(ratio):.2g} % of "
+                   f"|G| in the median, {100.0 * ratio[worst]:.3g} % at {used.hz[worst]:.4g} Hz"),
+        ("coherence", f"{np.median(used.coherence):.3f} in the median, least "
+                      f"{used.coherence.min():.3f} at "
+                      f"{used.hz[int(used.coherence.argmin())]:.4g} Hz"),
+        ("excitation", f"{found.periods} whole periods" if found.periods > 1 else
+                       "does not repeat; local polynomials part it from leakage"),
+    ]  # fmt: skip
+    missing = []
+    if found.hz[0] < used.hz[0]:
+        missing.append(f"{found.hz[0]:.4g} to {used.hz[0]:.4g} Hz")
+    inside = ranges(used.hz, used.weak, options)
+    missing += [inside] if inside else []
+    if found.hz[-1] > used.hz[-1]:
+        missing.append(f"{used.hz[-1]:.4g} to {0.5 / period:.4g} Hz")
+    if missing:
+        words = "there the spread is above |G|: excite more, or record longer"
+        rows.append(("missing", f"{', '.join(missing)}: {words}"))
+    below = f"below {found.hz[0]:.4g} Hz: the record has no line there"
+    rows.append(("no line", below))
+    ends = ranges(used.hz, used.leakage > options.leakage, options)
+    if ends and found.periods == 1:
+        share = f"{100.0 * options.leakage:.0f} % of the position at {ends}"
+        rows.append(("leakage", f"the ends of the record explain more than {share}: begin and end "
+                                "at rest, or record longer"))  # fmt: skip
+    if found.drift > estimate.drift:
+        share = f"{100.0 * found.drift:.2g} % of its range"
+        rows.append(("drift", f"the position ends {share} from where it began; first differences "
+                              "remove an offset, not friction"))  # fmt: skip
+    return rows

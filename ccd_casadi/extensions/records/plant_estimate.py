@@ -1,0 +1,243 @@
+"""The plant's response from a record of a loop: by the excitation as the instrument.
+
+With the excitation r (a force that is injected, or the reference) as the instrument
+
+    G = G_yr / G_ur
+
+has no bias of the noise in the loop, which y/u has: there noise goes round the loop into the force
+u (Söderström and Stoica, System Identification, 1989, section 8; Pintelon and Schoukens, 2012,
+section 2.6). G_yr and G_ur with their joint covariance C are those of `local_polynomial`, of first
+differences: these do not change G, and make of a drift an offset and of a step a pulse. Then
+
+    σ² = [1 -G] C [1 -G]ᴴ / |G_ur|²,     spread² = σ² F,   F the quantile of Fisher's F(2, 2ν)
+
+is the variance of Ĝ with ν degrees of freedom, and the radius of the disc about Ĝ that holds G with
+the stated probability, at each line alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from ccd_casadi.extensions.records.local_polynomial import WindowOptions, fit_locally
+from ccd_casadi.extensions.records.time_series import TimeSeries
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """Numbers of the estimate.
+
+    Attributes
+    ----------
+    confidence : float
+        Probability with which the plant lies within the spread, at each line.
+    allowance : float
+        Factor on the spread for what the polynomials leave of G; without it 94 % of lines lie
+        within a spread of 95 % (`benchmarks/oracle.py closed_loops`).
+    weak : float
+        Spread over |G| above which a line has too little excitation.
+    around : int
+        Lines about one over which a share of good ones is taken.
+    apart : float
+        Relative distance of the lines that are kept; all of them where the record has fewer.
+    least_samples : int
+        Of a record.
+    same_rate : float
+        Relative difference of the rates of records, at most.
+    repeats : float
+        Relative difference of an excitation and itself one period later, at most.
+    most_periods : int
+        Of a periodic record.
+    through : float
+        |G_ur| below which an injected force is not in the force.
+    drift : float
+        Offset between the ends of a record over the range of the position from which it is named.
+    """
+
+    confidence: float = 0.95
+    allowance: float = 1.1
+    weak: float = 1.0
+    around: int = 31
+    apart: float = 2e-3
+    least_samples: int = 256
+    same_rate: float = 1e-3
+    repeats: float = 1e-6
+    most_periods: int = 64
+    through: float = 0.5
+    drift: float = 0.02
+
+
+@dataclass(frozen=True)
+class PlantEstimate:
+    """A plant's response by a record.
+
+    Attributes
+    ----------
+    hz, G, spread : array (k,)
+        Lines in Hz, the response in m/N as the controller sees it, and the radius in m/N within
+        which the plant lies with the stated probability.
+    coherence : array (k,)
+        Share of the power of the position that the excitation explains.
+    periods : int
+        Whole periods of the excitation in the record; 1: it is not periodic.
+    resolution : float
+        Hz from line to line of the record.
+    weak : array (k,)
+        Whether a line has too little excitation: the spread is above |G|.
+    through : float
+        |G_ur| at the upper half of the coherent lines: 1 if the force contains what is injected,
+        0 if it is the controller's alone.
+    leakage : array (k,)
+        Share of the position's power about a line that the ends of the record explain.
+    drift : float
+        Offset of the position between the ends of the record over its range.
+    """
+
+    hz: Array
+    G: np.ndarray
+    spread: Array
+    coherence: Array
+    periods: int
+    resolution: float
+    weak: np.ndarray
+    through: float
+    leakage: Array
+    drift: float
+
+    @property
+    def used(self) -> "PlantEstimate":
+        """Without the lines before the first good one, and without those beyond the last around
+        which half of the lines are good."""
+        good = np.flatnonzero(~self.weak)
+        near = uniform_filter1d(1.0 - self.weak, EstimateOptions.around, mode="nearest") >= 0.5
+        last = np.flatnonzero(near & ~self.weak)
+        if not len(last):
+            return self.only(np.zeros(0, int))
+        return self.only(np.arange(good[0], last[-1] + 1))
+
+    def only(self, lines: np.ndarray) -> "PlantEstimate":
+        """At some lines."""
+        own = ("hz", "G", "spread", "coherence", "weak", "leakage")
+        return replace(self, **{name: getattr(self, name)[lines] for name in own})
+
+
+def estimate_plant(
+    series: TimeSeries | Sequence[TimeSeries],
+    options: EstimateOptions = EstimateOptions(),
+    windows: WindowOptions = WindowOptions(),
+) -> PlantEstimate:
+    """Estimate the plant's response from records.
+
+    Parameters
+    ----------
+    series : TimeSeries or sequence of them
+        Of one plant, in open loop with the force as the excitation; several are cut to the length
+        of the shortest. Where they differ, as with another amplitude, the spread is wider.
+    options, windows : EstimateOptions, WindowOptions
+
+    Returns
+    -------
+    PlantEstimate
+
+    Raises
+    ------
+    UserError
+        A record is too short, nothing excites the plant, or rates or periods differ.
+    """
+    records = [series] if isinstance(series, TimeSeries) else list(series)
+    step = records[0].period
+    for one in records:
+        _require_alive(one)
+        if abs(one.period / step - 1.0) > options.same_rate:
+            rates = f"{1.0 / step:.6g} and {1.0 / one.period:.6g} Hz"
+            raise UserError(f"the records have {rates}; give records of one rate")
+    shortest = min(len(one.force) for one in records)
+    signals = np.array([(one.position[:shortest], one.force[:shortest], one.excitation[:shortest])
+                        for one in records], float)  # fmt: skip
+    periods = 1
+    every = {_period(one[2], options) for one in signals}
+    if every != {0}:
+        if len(every) > 1:
+            raise UserError("the excitations of the records repeat after different times, or one "
+                            "does not; give records of one excitation")  # fmt: skip
+        period, last = every.pop(), shortest - 1
+        begin = max(int(np.argmax(np.abs(np.diff(one[2])) > 0.0)) for one in signals)
+        periods = min((last - begin) // period, options.most_periods)
+        signals = signals[:, :, last - periods * period :]
+    count = signals.shape[2]
+    if count < options.least_samples:
+        words = f"has {count} samples; a response needs {options.least_samples} or more"
+        raise UserError(f"the record {words}")
+    ends, positions = max(1, count // 50), signals[:, 0]
+    offset = np.abs(positions[:, -ends:].mean(axis=1) - positions[:, :ends].mean(axis=1))
+    drift = float((offset / np.ptp(positions, axis=1)).max())
+    changes = np.diff(signals, axis=2)
+    spectra = np.fft.rfft(changes, axis=2) / np.sqrt(count - 1)
+    resolution = 1.0 / ((count - 1) * step)
+    lines = _kept(spectra.shape[2], periods, options)
+    fit = fit_locally(spectra[:, :2], spectra[:, 2], lines, periods, windows)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        G = fit.G[:, 0] / fit.G[:, 1]
+        side = np.stack([np.ones_like(G), -G], axis=1)
+        variance = np.einsum("ki,kij,kj->k", side, fit.covariance, side.conj()).real
+        variance = variance / np.abs(fit.G[:, 1]) ** 2
+        freedom = np.maximum(fit.degrees, 1.0)
+        quantile = freedom * ((1.0 - options.confidence) ** (-1.0 / freedom) - 1.0)
+        spread = options.allowance * np.sqrt(np.maximum(variance, 0.0) * quantile)
+    known = np.isfinite(G) & np.isfinite(spread) & (G != 0.0)
+    hz, G, spread = resolution * lines[known], G[known], spread[known]
+    coherence = fit.coherence[known].min(axis=1)
+    if not len(hz):
+        raise UserError("no line of the record is excited enough to part the plant from noise; "
+                        "inject more force, or for longer")  # fmt: skip
+    weak = spread > options.weak * np.abs(G)
+    good = np.flatnonzero(~weak)
+    upper = good[len(good) // 2 :]
+    through = float(np.median(np.abs(fit.G[known, 1][upper]))) if len(upper) else np.nan
+    leakage = fit.transient[known, 0]
+    return PlantEstimate(hz, G, spread, coherence, periods, resolution, weak, through, leakage,
+                         drift)  # fmt: skip
+
+
+def _require_alive(series: TimeSeries) -> None:
+    """Raise UserError where a signal is constant."""
+    if not np.ptp(series.excitation) > 0.0:
+        raise UserError("the excitation is constant, so nothing moves the plant; name another "
+                        "column (--injected, --reference)")  # fmt: skip
+    for name in ("force", "position"):
+        if not np.ptp(getattr(series, name)) > 0.0:
+            raise UserError(f"the {name} is constant; name another column (--{name})")
+
+
+def _kept(count: int, periods: int, options: EstimateOptions) -> np.ndarray:
+    """Lines of the transform, those that are excited of a periodic record, thinned where they are
+    closer than `apart`."""
+    lines = np.arange(periods, count - 1, periods)
+    lines = lines[lines > 1] if periods == 1 else lines
+    kept, last = [], 0.0
+    for line in lines.tolist():
+        if line >= last * (1.0 + options.apart):
+            kept.append(line)
+            last = float(line)
+    return np.array(kept, int)
+
+
+def _period(excitation: Array, options: EstimateOptions) -> int:
+    """Samples after which the excitation repeats itself, at least twice in the record; 0: never."""
+    change = np.diff(excitation)
+    change = change[int(np.argmax(np.abs(change) > 0.0)) :]
+    size = len(change)
+    spectrum = np.fft.rfft(change, 2 * size)
+    product = np.fft.irfft(np.abs(spectrum) ** 2)[:size]
+    squares = np.concatenate([[0.0], np.cumsum(change**2)])
+    lags = np.arange(2, size // 2 + 1)
+    if not len(lags):
+        return 0
+    own = squares[size - lags] + (squares[-1] - squares[lags])  # of both parts that are compared
+    differs = own - 2.0 * product[lags]
+    repeats = np.flatnonzero((differs <= options.repeats * own) & (own > 0.5 * squares[-1]))
+    return int(lags[repeats[0]]) if len(repeats) else 0

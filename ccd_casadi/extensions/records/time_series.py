@@ -1,0 +1,189 @@
+"""Records of a loop: excitation, force and position over time, read from files of logs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.extensions.records.columns import Columns, read_columns
+from ccd_casadi.extensions.records.signal_names import REFERENCES, column_of, factor_of, parted
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Numbers of the test whether a record is sampled evenly.
+
+    Attributes
+    ----------
+    jitter : float
+        Deviation of a step from the period, over the period, up to which it is not named.
+    refused : float
+        That from which the record is refused.
+    """
+
+    jitter: float = 1e-3
+    refused: float = 0.05
+
+
+@dataclass(frozen=True)
+class SignalNames:
+    """Columns that the user states; None: found by their names.
+
+    Attributes
+    ----------
+    injected, reference, force, position, time : str or None
+        Of the excitation one of the first two.
+    rate_hz : float or None
+        Where no column holds the time.
+    open_loop : bool
+        The force is the excitation.
+    add_injected : bool
+        The force of the file is the controller's alone, and the plant's is that plus the injected.
+    """
+
+    injected: str | None = None
+    reference: str | None = None
+    force: str | None = None
+    position: str | None = None
+    time: str | None = None
+    rate_hz: float | None = None
+    open_loop: bool = False
+    add_injected: bool = False
+
+
+@dataclass(frozen=True)
+class TimeSeries:
+    """A record of one axis; SI.
+
+    Attributes
+    ----------
+    period : float
+        s, from sample to sample.
+    excitation, force, position : array (n,)
+        In open loop the excitation is the force.
+    injected : bool
+        Whether the excitation is added to the controller's force, else a reference or open loop.
+    words : str
+        How the file was understood.
+    """
+
+    period: float
+    excitation: Array
+    force: Array
+    position: Array
+    injected: bool = True
+    words: str = ""
+
+
+def read_record(path: Path, names: SignalNames = SignalNames()) -> TimeSeries:
+    """Read a record.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, .npz, .mat or WAV.
+    names : SignalNames
+
+    Returns
+    -------
+    TimeSeries
+
+    Raises
+    ------
+    UserError
+        A column is missing or may be one of two, a unit is not known, or samples are missing.
+    """
+    columns, rate, notes = read_columns(path)
+    if names.injected and names.reference:
+        raise UserError("give --injected or --reference: one of them is the excitation")
+    period, timing = _period(path, columns, names, rate)
+    force, position = (_column(path, columns, role, getattr(names, role))
+                       for role in ("force", "position"))  # fmt: skip
+    stated = names.injected or names.reference
+    if names.open_loop:
+        if stated:
+            raise UserError("--open-loop: the force is the excitation; drop the other option")
+        excitation: str | None = force
+    else:
+        excitation = column_of(path, "excitation", columns, stated)
+    if excitation is None:
+        raise UserError(
+            f"{path}: no column is an excitation, and {force!r} over {position!r} is the plant in "
+            "open loop alone, in closed loop it is not; state --open-loop, or the column with "
+            "--injected or --reference"
+        )
+    if len({force, position, excitation}) < (2 if names.open_loop else 3):
+        raise UserError(f"{path}: two signals are the same column; state three")
+    injected = not names.open_loop and (
+        names.injected is not None
+        or (names.reference is None and parted(excitation)[0] not in REFERENCES)
+    )
+    scaled, units = [], []
+    for role, name in (("position", position), ("force", force)):
+        factor, unit = factor_of(path, role, name)
+        scaled.append(factor * columns[name])
+        units.append(f"{role} {name!r} in {unit}")
+    if names.open_loop:
+        loop, drive = "open loop", scaled[1]
+    else:
+        role = "force" if injected else "position"
+        factor, unit = factor_of(path, role, excitation)
+        drive = factor * columns[excitation]
+        kind = "injected force" if injected else "reference"
+        loop = f"closed loop, {kind} {excitation!r} in {unit}"
+    if names.add_injected and not injected:
+        raise UserError("--add-injected: no force is injected; drop it or state --injected")
+    if names.add_injected:
+        scaled[1] = scaled[1] + drive
+        units[1] += " plus what is injected"
+    words = "; ".join([f"{len(drive)} samples at {1.0 / period:.6g} Hz", loop, *reversed(units),
+                       *timing, *notes])  # fmt: skip
+    return TimeSeries(period, drive, scaled[1], scaled[0], injected, words)
+
+
+def _column(path: Path, columns: Columns, role: str, stated: str | None) -> str:
+    found = column_of(path, role, columns, stated)
+    if found is None:
+        raise UserError(
+            f"{path}: no column is a {role} by its name; state it with --{role}: it has "
+            f"{', '.join(columns)}"
+        )
+    return found
+
+
+def _period(
+    path: Path, columns: Columns, names: SignalNames, rate: float | None,
+    options: SamplingOptions = SamplingOptions(),
+) -> tuple[float, list[str]]:  # fmt: skip
+    """Period in s, and what is to be reported of it."""
+    name = column_of(path, "time", columns, names.time)
+    if name is None:
+        stated = names.rate_hz or rate
+        if stated is None:
+            raise UserError(f"{path}: no column is the time; name it t, or state --rate-hz")
+        return 1.0 / stated, []
+    factor, _ = factor_of(path, "time", name)
+    t = factor * columns[name]
+    steps = np.diff(t)
+    if len(steps) < 2 or not (steps > 0.0).all():
+        row = int(np.argmax(steps <= 0.0)) + 2 if len(steps) else 1
+        raise UserError(f"{path}: {name}: does not rise at sample {row}; give each sample once")
+    period = float(np.median(steps))
+    whole = np.round(steps / period)
+    gaps = np.flatnonzero(whole > 1.0)
+    if len(gaps):
+        lost, where = int((whole[gaps] - 1.0).sum()), t[gaps[0]]
+        raise UserError(f"{path}: {lost} samples are missing, the first after {where:.6g} s; give "
+                        "the part of the record between gaps")  # fmt: skip
+    period = float(t[-1] - t[0]) / len(steps)
+    off = float(np.abs(steps / period - 1.0).max())
+    if off > options.refused:
+        at = t[int(np.abs(steps / period - 1.0).argmax())]
+        raise UserError(f"{path}: a step of {name} is {100.0 * off:.3g} % off the period, the "
+                        f"largest at {at:.6g} s; sample evenly")  # fmt: skip
+    if names.rate_hz and abs(names.rate_hz * period - 1.0) > options.jitter:
+        raise UserError(f"{path}: {name} has {1.0 / period:.6g} Hz and --rate-hz is "
+                        f"{names.rate_hz:.6g}; drop the option")  # fmt: skip
+    return period, [f"steps of {name} off by {100.0 * off:.2g} %"] if off > options.jitter else []

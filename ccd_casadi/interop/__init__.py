@@ -1,1 +1,0 @@
-"""Between this project and other people's frameworks: tables of pandas, components of OpenMDAO."""

@@ -1,1 +1,0 @@
-"""Time series of a machine, in open or closed loop, and the plant's frequency response of them."""
