@@ -20,6 +20,7 @@ COMMANDS = {
     "gap": ("ccd_casadi.gap", "bound what any controller reaches at one theta, as JSON"),
     "record": ("ccd_casadi.record", "estimate a plant's response from records of its loop"),
     "tune": ("ccd_casadi.tune", "find the fastest PID with notches for a plant that exists"),
+    "drive": ("ccd_casadi.drive", "design an industrial drive's cascade, rounded and proven"),
     "solve": ("ccd_casadi.solve", "design stage and controller together, verify, report"),
     "compare": ("ccd_casadi.compare", "run every method on a case, side by side"),
     "worth": ("ccd_casadi.worth", "estimate in seconds what co-design gains"),

@@ -29,11 +29,15 @@ class DriveOptions:
         Plants that are drawn for the judge besides the corners.
     rounds : int
         Of search and proof: a plant that the proof finds is added.
+    lowered, lower : int, float
+        How often, and by which share, ω_b is lowered where the proof finds a slower plant.
     search, rounding : SearchOptions, RoundingOptions
     """
 
     draws: int = 24
     rounds: int = 3
+    lowered: int = 10
+    lower: float = 1e-3
     search: SearchOptions = field(default_factory=SearchOptions)
     rounding: RoundingOptions = field(default_factory=RoundingOptions)
 
@@ -47,6 +51,8 @@ class DriveDesign:
     cascade : Cascade
     values : array (n,)
         On the drive's grid, SI.
+    bandwidth : float
+        ω_b in rad/s, for which the proof is.
     free : Candidate
         Before rounding.
     certificate : SetCertificate
@@ -57,6 +63,7 @@ class DriveDesign:
 
     cascade: Cascade
     values: Array
+    bandwidth: float
     free: Candidate
     certificate: SetCertificate
     proof: Proof
@@ -107,15 +114,20 @@ def design_drive(
         rounded = on_the_grid(search, free, options.rounding)
         judged = judge(cascade, rounded.values, uncertain, bounds, sampling, points, seed, workers,
                        options.draws)  # fmt: skip
-        band = judged.bandwidth if judged.passed else rounded.bandwidth
+        band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
         proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
+        for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
+            if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):
+                break
+            band *= 1.0 - options.lower
+            proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
         if not proof.refuted:
             break
         points = [*points, (proof.option, np.array(proof.point))]
         search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
         free = search.settled(free)
     cascade.require_fit(rounded.values)
-    return DriveDesign(cascade, rounded.values, free, judged, proof)
+    return DriveDesign(cascade, rounded.values, band, free, judged, proof)
 
 
 def judge(

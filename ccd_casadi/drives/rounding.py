@@ -17,14 +17,15 @@ class RoundingOptions:
     ----------
     steps : int
         Of the other values, for each neighbour.
-    passes : int
-        Over all values by single steps, at most.
+    passes, hops : int, tuple of int
+        Over all values by these numbers of steps, at most.
     fine : float
         A step that is this small relative to its value is rounded without a search.
     """
 
     steps: int = 6
-    passes: int = 6
+    passes: int = 8
+    hops: tuple[int, ...] = (-3, -1, 1, 3)
     fine: float = 1e-5
 
 
@@ -55,6 +56,7 @@ def on_the_grid(
         near = {own.rounded(values[i], by) for by in (-1, 0, 1)}
         if coarse[i] < options.fine:
             near = {own.rounded(values[i])}
+        search.refine(values)
         found = []
         for value in sorted(near):
             there = values.copy()
@@ -65,7 +67,6 @@ def on_the_grid(
             break
         best = min(found, key=lambda one: _merit(search, one))
         values, band = best.values.copy(), best.bandwidth
-        values[fixed] = np.where(fixed, values, 0.0)[fixed]
     values = np.array([own.rounded(value) for own, value in zip(settings, values, strict=True)])
     return _by_steps(search, values, options)
 
@@ -78,19 +79,18 @@ def _by_steps(search: Search, values: Array, options: RoundingOptions) -> Candid
 
     here = of(values)
     for _ in range(options.passes):
-        before = here
+        moved = False
         for i, own in enumerate(search.cascade.settings):
-            for by in (-3, -1, 1, 3):
+            for by in options.hops:
                 there = here.values.copy()
                 there[i] = own.rounded(there[i], by)
                 if there[i] > 0.0 and there[i] != here.values[i]:
                     found = of(there)
                     if _merit(search, found) < _merit(search, here) and search.stable(there):
-                        here = found
-        search.refine(here.values)
-        here = of(here.values)
-        if here is before or _merit(search, here) >= _merit(search, before):
+                        here, moved = found, True
+        if not search.refine(here.values) and not moved:
             break
+        here = of(here.values)
     return here
 
 

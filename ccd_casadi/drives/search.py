@@ -34,13 +34,13 @@ class SearchOptions:
         Starting points; steps from each, and the share of them that is kept then; steps from these.
     refinements, finer : int, int
         Of the grid by the peaks between its points, and points of the finer one to one of its.
-    alert, met : float
-        Share of a bound from which on a peak is added; ln of a figure over its bound that counts as
-        met.
+    alert, missed, met : float
+        Share below a bound from which on a peak is added, and by how much it exceeds the grid's
+        values beside it; ln of a figure over its bound that counts as met.
     points : int
         Of the grid of frequencies, as many again spread evenly; more lie about resonances.
-    lowest : float
-        Of the grid, over ω_low.
+    lowest, last : float
+        Of the grid, over ω_low and over half the sampling rate.
     penalty : float
         ρ, per violation of one (natural) logarithm.
     radius, least_radius, grow, shrink : float
@@ -71,6 +71,8 @@ class SearchOptions:
     refinements: int = 10
     finer: int = 8
     alert: float = 5e-3
+    missed: float = 5e-5
+    last: float = 0.999999
     met: float = 4e-4
     points: int = 200
     lowest: float = 0.2
@@ -123,10 +125,10 @@ class Search:
         rates = np.concatenate([np.abs(plant.rates) for plant in plants])
         near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
         about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
-        grid = np.geomspace(options.lowest * bounds.omega_low, 0.999 * np.pi / T, options.points)
-        low = np.append(np.linspace(0.0, 0.999 * np.pi / T, options.points)[1:], bounds.omega_low)
+        grid = np.geomspace(options.lowest * bounds.omega_low, options.last * np.pi / T, options.points)
+        low = np.append(np.linspace(0.0, options.last * np.pi / T, options.points)[1:], bounds.omega_low)
         self.period = T
-        self.on(np.unique(np.concatenate([grid, about[about < 0.999 * np.pi / T], low])))
+        self.on(np.unique(np.concatenate([grid, about[about < options.last * np.pi / T], low])))
         ranges = cascade.ranges.copy()
         for i, setting in enumerate(cascade.settings):
             if "denominator" in setting.name and not setting.unit:
@@ -301,22 +303,25 @@ class Search:
 
     def refine(self, values: Array) -> bool:
         """Add to the grid where |S| peaks above its bounds between its points."""
-        coarse, T = self.omega, self.period
+        coarse, T, o = self.omega, self.period, self.options
         fine = np.exp(np.interp(
-            np.arange(0.0, len(coarse) - 1.0, 1.0 / self.options.finer),
-            np.arange(len(coarse)), np.log(coarse),
+            np.arange((len(coarse) - 1) * o.finer + 1) / o.finer, np.arange(len(coarse)),
+            np.log(coarse),
         ))  # fmt: skip
         K = self.cascade.responses(values, np.exp(1j * fine * T))[0]
         new: list[float] = []
         for system in self.systems:
             L = system.swept(fine)[:, :, 0].T * K
             for _, S, limit in self._figures(L):
-                top = np.r_[False, (S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:]), False]
-                new += fine[top & (S > limit * (1.0 - self.options.alert))].tolist()
-        more = np.setdiff1d(np.round(new, 9), np.round(coarse, 9))
-        if not len(more):
+                cells = S[:-1].reshape(-1, o.finer)
+                ends = np.maximum(S[: -o.finer : o.finer], S[o.finer :: o.finer])
+                top = cells.max(axis=1)
+                high = (top > ends * (1.0 + o.missed)) & (top > limit * (1.0 - o.alert))
+                at = cells.argmax(axis=1) + o.finer * np.arange(len(cells))
+                new += fine[at[high]].tolist()
+        if not new:
             return False
-        self.on(np.union1d(coarse, more))
+        self.on(np.union1d(coarse, new))
         return True
 
     def judged(self, values: Array) -> tuple[float, float]:
