@@ -1,4 +1,4 @@
-"""`python -m ccd_casadi.drive CASE.toml`: a controller in the form that an industrial drive accepts."""
+"""`python -m ccd_casadi.drive CASE.toml`: an industrial drive's cascade, rounded and proven."""
 
 import argparse
 import sys

@@ -250,9 +250,7 @@ class DriveTable:
     )
     velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
     filters: int = key("filters of the current command in use", 3, check=checks.count(0))
-    setpoint_filters: int = key(
-        "filters of the velocity setpoint in use", 0, check=checks.count(0)
-    )
+    setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ typedef {number} number;
 typedef struct {{ real last, total; int begun; number old[{max(count, 1)}][4]; }} cascade_state;
 
 static const number FILTERS[{max(count, 1)}][5] = {{
-{(',' + chr(10)).join(rows) or '    {0}'}
+{("," + chr(10)).join(rows) or "    {0}"}
 }};
 
 static real filtered(const number *c, number *s, real u)
@@ -175,6 +175,6 @@ def program_of(
         else:
             own[slot.place].append(tuple(real(c) for c in numbers))
     Kv, Kp, Tn = (float(value) for value in values[:3])
-    gains = (Kv, Kp, cascade.period / Tn, 1.0 / cascade.period)
-    return Program(kind, real, *(float(real(g)) for g in gains), tuple(own["setpoint"]),
-                   tuple(own["current"]), options)  # fmt: skip
+    share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
+    return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
+                   tuple(own["setpoint"]), tuple(own["current"]), options)  # fmt: skip

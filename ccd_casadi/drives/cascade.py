@@ -20,6 +20,8 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
+Values = Sequence[float] | Array  # SI, in the order of the settings
+
 
 class Polynomials(NamedTuple):
     """K as products of polynomials in 1/z: K_j = Π above_j/(Π below (1 - 1/z)), of which the
@@ -73,7 +75,7 @@ class Cascade:
         found[1, hertz] = np.minimum(found[1, hertz], 0.49 / self.period)
         return found
 
-    def parts(self, values: Sequence[float]) -> list[dict[str, float]]:
+    def parts(self, values: Values) -> list[dict[str, float]]:
         """The parameters of each filter by name."""
         found, at = [], 3
         for slot in self.slots:
@@ -83,7 +85,7 @@ class Cascade:
             at += len(names)
         return found
 
-    def responses(self, values: Sequence[float], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def responses(self, values: Values, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """K (p, k) before coefficients are rounded, and ∂K/∂ln values (n, p, k)."""
         Kv, Kp, Tn = (float(value) for value in values[:3])
         away, n = 1.0 - 1.0 / z, len(self.settings)
@@ -110,7 +112,7 @@ class Cascade:
             dK[:, sensor] += path * steep
         return K, dK
 
-    def polynomials(self, values: Sequence[float]) -> Polynomials:
+    def polynomials(self, values: Values) -> Polynomials:
         """K with its coefficients as the drive rounds them."""
         Kv, Kp, Tn = (float(value) for value in values[:3])
         PI = Kp * np.array([1.0 + self.period / Tn, -1.0])
@@ -126,7 +128,7 @@ class Cascade:
             (*below["current"], *below["setpoint"]),
         )
 
-    def state_space(self, values: Sequence[float]) -> StateSpace:
+    def state_space(self, values: Values) -> StateSpace:
         """K(z), errors of all sensors in, force out, coefficients as the drive rounds them."""
         Kv, Kp, Tn = (float(value) for value in values[:3])
         T = self.period
@@ -140,15 +142,15 @@ class Cascade:
         motor = StateSpace(np.zeros((1, 1)), np.ones((1, 1)), np.array([[-1.0 / T]]),
                            np.array([[1.0 / T]]), period=T)  # fmt: skip
         both = _beside(ahead, self.position, motor, self.velocity, self.sensors)
-        found = _series(both, StateSpace(
-            np.eye(1), np.ones((1, 1)), np.array([[Kp * T / Tn]]), np.array([[Kp * (1.0 + T / Tn)]]),
-            period=T,
-        ))  # fmt: skip
+        share = Kp * T / Tn
+        PI = StateSpace(np.eye(1), np.ones((1, 1)), np.array([[share]]), np.array([[Kp + share]]),
+                        period=T)  # fmt: skip
+        found = _series(both, PI)
         for one in blocks["current"]:
             found = _series(found, one)
         return found
 
-    def require_fit(self, values: Sequence[float]) -> None:
+    def require_fit(self, values: Values) -> None:
         """Raise UserError where the drive's numbers do not hold a filter's coefficients."""
         for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
             if not block.fits(own):

@@ -70,7 +70,7 @@ class DriveDesign:
 
     @property
     def status(self) -> str:
-        """"verified" where the judge passes it and no proof denies it."""
+        """ "verified" where the judge passes it and no proof denies it."""
         passed = self.certificate.passed and not self.proof.denies
         return "verified" if passed else "not_verified"
 

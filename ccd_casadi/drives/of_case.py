@@ -11,7 +11,7 @@ from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.cases.controller_tables import DriveTable
 from ccd_casadi.drives.cascade import Cascade
 from ccd_casadi.drives.design import require_known
-from ccd_casadi.drives.drive import read_drive
+from ccd_casadi.drives.drive import Slot, read_drive
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
@@ -63,7 +63,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             raise UserError("loop.rate_hz is missing; a drive is sampled, give its rate")
         bounds = bounds_of(problem)
         require_known(bounds)
-        filters = []
+        filters: list[Slot] = []
         for place, count in (("current", table.filters), ("setpoint", table.setpoint_filters)):
             there = drive.places(place)
             if count > len(there):

@@ -50,7 +50,7 @@ class CascadeFamily(LoopFamily):
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             t.append(variable((boxes.low[k + 1] - middle) / half,
                               (boxes.high[k + 1] - middle) / half, k + 1, n))  # fmt: skip
-        coefficients = self.model.over(t or [f * 0.0], n)
+        coefficients = self.model.over(t, w)
         D, *N = [_horner(row, w) for row in coefficients]
         count = len(N) // 2
         late = turn
@@ -114,7 +114,7 @@ def _product(factors: tuple[Array, ...], turn: Affine) -> Affine:
 
 def prove_cascade(
     cascade: Cascade, values: Array, bandwidth: float, uncertain: UncertainPlant, bounds: Bounds,
-    sampling: Sampling, options: BoxProofOptions = BoxProofOptions(),
+    sampling: Sampling, options: BoxProofOptions | None = None,
 ) -> Proof:  # fmt: skip
     """Prove bounds and stability of rounded values on the whole box.
 
@@ -126,12 +126,13 @@ def prove_cascade(
         ω_b, rad/s.
     uncertain : UncertainPlant
     bounds, sampling : Bounds, Sampling
-    options : BoxProofOptions
+    options : BoxProofOptions, optional
 
     Returns
     -------
     Proof
     """
+    options = options or BoxProofOptions()
     K, names = cascade.state_space(values), uncertain.names
     slack, families = options.slack, []
     for option in range(len(uncertain.options)):

@@ -197,27 +197,25 @@ class SampledModel:
         error = error + np.where(small, np.abs(found), 0.0).sum(axis=tuple(range(count)))
         return np.where(small, 0.0, found), np.asarray(error)
 
-    def over(self, t: list[Affine], n: int) -> list[list[Affine]]:
-        """Every coefficient over boxes of t, as forms of n variables."""
+    def over(self, t: list[Affine], like: Affine) -> list[list[Affine]]:
+        """Every coefficient over boxes of t, as forms of the variables of `like`."""
         powers, error = self.polynomials
-        boxes = len(t[0].centre) if t else n
-        rows, columns = error.shape
-        return [[self._form(powers[..., i, k], float(error[i, k]), t, boxes)
-                 for k in range(columns)] for i in range(rows)]  # fmt: skip
+        zero = Affine(0.0 * like.centre, 0.0 * like.slope, 0.0 * like.rest)
+        return [[_form(powers[..., i, k], float(error[i, k]), t, zero)
+                 for k in range(error.shape[1])] for i in range(len(error))]  # fmt: skip
 
-    def _form(self, powers: Array, error: float, t: list[Affine], boxes: int) -> Affine:
-        """A polynomial of several t by Horner's rule, one parameter after the other."""
-        variables = len(t[0].slope) if t else 1
 
-        def of(c: Array, left: list[Affine]) -> Affine:
-            if not left:
-                return Affine(np.full(boxes, float(c)), np.zeros((variables, boxes)),
-                              np.zeros(boxes))  # fmt: skip
-            last = max((i for i in range(len(c)) if c[i].any()), default=0)
-            found = of(c[last], left[1:])
-            for i in range(last - 1, -1, -1):
-                found = found * left[0] + of(c[i], left[1:])
-            return found
+def _form(powers: Array, error: float, t: list[Affine], zero: Affine) -> Affine:
+    """A polynomial of several t by Horner's rule, one parameter after the other."""
 
-        found = of(powers, t)
-        return Affine(found.centre, found.slope, found.rest + error)
+    def of(c: Array, left: list[Affine]) -> Affine:
+        if not left:
+            return zero + complex(c)
+        last = max((i for i in range(len(c)) if c[i].any()), default=0)
+        found = of(c[last], left[1:])
+        for i in range(last - 1, -1, -1):
+            found = found * left[0] + of(c[i], left[1:])
+        return found
+
+    found = of(powers, t)
+    return Affine(found.centre, found.slope, found.rest + error)

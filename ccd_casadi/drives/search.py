@@ -125,10 +125,11 @@ class Search:
         rates = np.concatenate([np.abs(plant.rates) for plant in plants])
         near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
         about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
-        grid = np.geomspace(options.lowest * bounds.omega_low, options.last * np.pi / T, options.points)
-        low = np.append(np.linspace(0.0, options.last * np.pi / T, options.points)[1:], bounds.omega_low)
-        self.period = T
-        self.on(np.unique(np.concatenate([grid, about[about < options.last * np.pi / T], low])))
+        top, self.period = options.last * np.pi / T, T
+        grid = np.geomspace(options.lowest * bounds.omega_low, top, options.points)
+        even = np.linspace(0.0, top, options.points)[1:]
+        parts = [grid, even, about[about < top], np.array([bounds.omega_low])]
+        self.on(np.unique(np.concatenate(parts)))
         ranges = cascade.ranges.copy()
         for i, setting in enumerate(cascade.settings):
             if "denominator" in setting.name and not setting.unit:
@@ -201,7 +202,7 @@ class Search:
         return self.bounds.channels[sensor].name if self.bounds.channels else ""
 
     def start(self, rng: np.random.Generator) -> Array | None:
-        """Values at which every loop is stable, the filters next to 1; None where none was found."""
+        """Values at which every loop is stable, filters next to 1; None where none was found."""
         o, unit = self.options, self.options.bandwidth * HZ
         low, high = np.log(o.frequencies)
         gains = np.array([o.gains * unit * 4.0, self.mass * unit * 6.0]) * np.exp(
@@ -239,7 +240,8 @@ class Search:
         merit = -here[-1] + o.penalty * max(0.0, c.max())
         for _ in range(steps or o.steps):
             n = len(here)
-            step = self._step(c, J, np.maximum(-radius, low - here), np.minimum(radius, high - here))
+            ends = np.maximum(-radius, low - here), np.minimum(radius, high - here)
+            step = self._step(c, J, *ends)
             if step is None:
                 break
             there = np.clip(here + step[:n], low, high)
@@ -342,7 +344,7 @@ class Search:
         if self.bounds.shape is not None:
             x = self.bounds.reached(np.sqrt(2.0) * S)
             return float((self.omega / x).min())
-        over = np.flatnonzero(S > np.sqrt(0.5))
+        over = np.flatnonzero(2.0 * S**2 > 1.0)
         return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
 
     def _figures(self, L: np.ndarray) -> list[tuple[int | None, Array, float]]:

@@ -1,4 +1,4 @@
-"""The sheet that a person types into a drive: numbers, names, values and units; as text and JSON."""
+"""The sheet that a person types into a drive: numbers, names, values, units; as text and JSON."""
 
 from collections.abc import Mapping
 from typing import Any
