@@ -98,10 +98,10 @@ class SampledModel:
             if not modal.rigid[i]:
                 own = p.get(f"mode_shift {number[i]}", 0.0)
                 r[i] = (one + p.get("resonance_shift", 0.0)) * (one + own)
-        K, flexible = modal.K * r[:, None] * r, np.ix_(~modal.rigid, ~modal.rigid)
+        K = modal.K * r[:, None] * r
         shifted = np.diag(2.0 * float(system.damping_ratio or 0.0) * modal.natural)
         D = modal.D - shifted + shifted * r
-        D[flexible] *= p.get("damping", 1.0)
+        D = D * p.get("damping", 1.0)
         B = modal.B * (one + p.get("gain", 0.0))
         if size:
             given = np.abs(modal.D - shifted) + np.abs(shifted) * r

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from ccd_casadi.drives.cascade import Cascade
+from ccd_casadi.drives.forms import Filter, Number
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
@@ -61,6 +62,8 @@ class SearchOptions:
         Hz, of a start.
     highest : float
         Frequency of a filter over the sampling rate: next to half of it features are narrow.
+    difference : float
+        Of logarithms, for the slopes of fixed-point coefficients.
     least_damping : float
         Of a filter's denominator: below it a filter is a needle.
     """
@@ -91,6 +94,7 @@ class SearchOptions:
     gains: float = 1.0
     bandwidth: float = 15.0
     highest: float = 0.4
+    difference: float = 1e-5
     least_damping: float = 0.1
 
 
@@ -186,12 +190,37 @@ class Search:
                 if place == self.cascade.position:
                     values.append(S - shape)
                     slopes.append(np.column_stack([dS, by_x]))
-                    at = np.searchsorted(w, b.omega_low)
+                    at = int(np.searchsorted(w, b.omega_low))
                     values.append(S[at : at + 1] - np.log(b.S_low))
                     slopes.append(np.append(dS[at], 0.0)[None])
+        if self.cascade.drive.number is Number.FIXED_30:
+            for value, slope in self._coefficients(kappa):
+                values.append(value)
+                slopes.append(slope)
         c = np.concatenate(values) + self.options.room
         good = np.isfinite(c)
         return c[good], np.concatenate(slopes)[good]
+
+    def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
+        """ln of the largest coefficient of each filter over what fixed point holds, by central
+        differences: it is a function of four numbers."""
+        h, at, found = self.options.difference, 3, []
+        blocks = self.cascade.filters
+        for slot, block in zip(self.cascade.slots, blocks, strict=True):
+            names = list(slot.settings)
+
+            def most(own: Array, block: Filter = block, names: list[str] = names) -> float:
+                values = dict(zip(names, np.exp(own).tolist(), strict=True))
+                b, a = block.coefficients(values)
+                return float(np.log(max(np.abs(b).max(), np.abs(a).max()) / block.largest_fixed))
+
+            own = kappa[at : at + len(names)]
+            slope = np.zeros((1, len(kappa) + 1))
+            for i, step in enumerate(h * np.eye(len(names))):
+                slope[0, at + i] = (most(own + step) - most(own - step)) / (2.0 * h)
+            found.append((np.array([most(own)]), slope))
+            at += len(names)
+        return found
 
     def _places(self) -> list[int | None]:
         """Sensors that count, and None for the actuator."""
@@ -285,11 +314,16 @@ class Search:
         o, rng = self.options, np.random.default_rng(seed)
         starts = [values for _ in range(o.starts) if (values := self.start(rng)) is not None]
         left = [Candidate(values, o.bandwidth * HZ, 0.0) for values in starts]
+        others: list[Candidate] = []
         for share, steps in o.stages:
             left = [self.climb(one.values, None, steps, one.bandwidth) for one in left]
             left.sort(key=lambda one: max(one.excess, 0.0) * o.penalty - np.log(one.bandwidth))
-            left = left[: max(1, round(share * len(starts)))]
+            left, others = left[: (n := max(1, round(share * len(starts))))], left[n:]
         found = [self.settled(one) for one in left]
+        for one in others:  # where none of the best meets the bounds between the grid's points
+            if any(made.excess < o.met for made in found):
+                break
+            found.append(self.settled(one))
         good = [one for one in found if one.excess < o.met]
         return max(good, key=lambda one: one.bandwidth, default=None)
 
