@@ -1,4 +1,4 @@
-"""The program of a cascade, equal to the bit to a simulation that is written apart, and to its C."""
+"""The program of a cascade is a simulation that is written apart, and its C, to the bit."""
 
 import ctypes
 import shutil

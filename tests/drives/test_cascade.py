@@ -122,7 +122,8 @@ def test_an_unstable_loop_is_not_proven() -> None:
 def test_what_is_not_a_polynomial_here_is_not_proven() -> None:
     proof = prove_cascade(cascade(), SLOW, 20.0 * HZ, uncertain(mode_shift=0.01, gain=0.1,
                           damping=(0.9, 1.1)), bounds(4.0), RATE)  # fmt: skip
-    assert not proof.proven and proof.outcome is ProofOutcome.VARIES
+    assert not proof.proven
+    assert proof.outcome is ProofOutcome.VARIES
 
 
 def test_rows_have_exact_slopes() -> None:
@@ -139,7 +140,8 @@ def test_rows_have_exact_slopes() -> None:
 def test_a_design_is_on_the_grid_verified_and_proven() -> None:
     few = DriveOptions(search=SearchOptions(starts=3, stages=((0.4, 20),)))
     found = design_drive(cascade("sinamics_s120"), uncertain(), bounds(), RATE, options=few)
-    assert found.status == "verified" and found.proof.proven, found.proof.words
+    assert found.status == "verified"
+    assert found.proof.proven, found.proof.words
     for setting, value in zip(found.cascade.settings, found.values.tolist(), strict=True):
         steps = value * setting.per_si / setting.step
         assert abs(steps - round(steps)) < 1e-6 * max(1.0, abs(steps)), setting.name
