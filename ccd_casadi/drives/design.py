@@ -70,9 +70,9 @@ class DriveDesign:
 
     @property
     def status(self) -> str:
-        """ "verified" where the judge passes it and no proof denies it."""
-        passed = self.certificate.passed and not self.proof.denies
-        return "verified" if passed else "not_verified"
+        """verified: the judge passes it, and it is proven on the whole set."""
+        both = self.certificate.passed and self.proof.proven
+        return "verified" if both else "not_verified"
 
     @property
     def controller(self) -> StateSpace:
