@@ -131,12 +131,12 @@ def test_a_new_extension_is_one_file(tmp_path: Path) -> None:
 
 
 def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = Extension(commands={"drive": ("my_package.drive", "move it")})
-    point = SimpleNamespace(name="drives", load=lambda: own)
+    own = Extension(commands={"press": ("my_package.press", "press it")})
+    point = SimpleNamespace(name="presses", load=lambda: own)
     monkeypatch.setattr(extensions, "entry_points", lambda group: [point])
     extensions.installed.cache_clear()
     try:
-        assert extensions.find("commands", "drive") == own.commands["drive"]
-        assert set(extensions.declared("commands")) == {*SHIPPED["commands"], "drive"}
+        assert extensions.find("commands", "press") == own.commands["press"]
+        assert set(extensions.declared("commands")) == {*SHIPPED["commands"], "press"}
     finally:
         extensions.installed.cache_clear()

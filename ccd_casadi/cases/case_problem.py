@@ -59,6 +59,9 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     (('m1', 'm2'), -0.995, 6.283)
     """
     inner = case.inner
+    if case.drive.name is not None:
+        words = "is designed by `ccd drive` alone; use that, or drop [drive] for free sections"
+        raise CaseError(f"{case.path}: drive: {words}")
     file = function = given = None
     if callable(case.plant.function):
         function, given = case.plant.name, GivenFunction(case.plant.function)

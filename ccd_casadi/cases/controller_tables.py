@@ -241,6 +241,19 @@ class LoopTable:
 
 
 @dataclass(frozen=True)
+class DriveTable:
+    """[drive]: the industrial drive that `ccd drive` designs a cascade for; other commands refuse
+    a case that has one."""
+
+    name: str | None = key(
+        "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file like theirs (.toml)", None
+    )
+    velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
+    filters: int = key("filters of the current command in use", 3, check=checks.count(0))
+    setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
+
+
+@dataclass(frozen=True)
 class FiltersTable:
     """[actuator] before the forces, [sensor] behind the sensors: low passes, one or one of each
     channel."""

@@ -334,7 +334,7 @@ class Case(NotebookHtml):
     plant : PlantTable
     theta, fixed : tuples of Parameter
         Searched parameters; fixed ones and those that vary.
-    objective, weights, inner, suspension, places, robust, controller, loop : tables
+    objective, weights, inner, suspension, places, robust, controller, loop, drive : tables
     actuator, sensor, budget : tables
     sampling, outer, baseline, limits, motor, move, units : tables
         Of the same names, in units of the file.
@@ -351,6 +351,7 @@ class Case(NotebookHtml):
     robust: RobustTable
     controller: controller_tables.ControllerTable
     loop: controller_tables.LoopTable
+    drive: controller_tables.DriveTable
     actuator: controller_tables.FiltersTable
     sensor: controller_tables.FiltersTable
     budget: BudgetTable

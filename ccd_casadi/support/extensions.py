@@ -21,8 +21,9 @@ GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other d
 # What the extensions of this distribution have, for the message where one was removed.
 SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "commands": {
-        "cross_check": "cross_check", "explore": "explorer", "gap": "limitations",
-        "imported": "imported", "record": "records", "tune": "measured", "worth": "worth",
+        "cross_check": "cross_check", "drive": "drives", "explore": "explorer",
+        "gap": "limitations", "imported": "imported", "record": "records", "tune": "measured",
+        "worth": "worth",
     },
     "plants": {
         "cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",

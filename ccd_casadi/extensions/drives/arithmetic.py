@@ -1,0 +1,180 @@
+"""A cascade's difference equations as they run: in Python, and the same as C.
+
+Counts of the encoders in, force out. Gains and the PI compute in the drive's floating point; a
+fixed-point filter takes and gives integers of `grain` N, its products summed in 64 bits and shifted
+right by 30, towards minus infinity.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.extensions.drives.cascade import Cascade
+from ccd_casadi.extensions.drives.forms import Number
+from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True)
+class ArithmeticOptions:
+    """What the drive's file does not say.
+
+    Attributes
+    ----------
+    grain : float
+        N, of an integer of a fixed-point filter's signal.
+    bits : int
+        Of its coefficients' fraction.
+    """
+
+    grain: float = 2.0**-20
+    bits: int = 30
+
+
+@dataclass(frozen=True)
+class Program:
+    """Numbers of one cascade's program, in the order in which they are used.
+
+    Attributes
+    ----------
+    kind : Number
+    real : type
+        The floating point.
+    Kv, Kp, share, rate : float
+        1/s; N s/m; T/Tn; 1/T.
+    setpoint, current : tuple of (b0, b1, b2, a1, a2)
+        Filters; integers where the drive has fixed point.
+    options : ArithmeticOptions
+    """
+
+    kind: Number
+    real: type
+    Kv: float
+    Kp: float
+    share: float
+    rate: float
+    setpoint: tuple[tuple[Any, ...], ...]
+    current: tuple[tuple[Any, ...], ...]
+    options: ArithmeticOptions
+
+    def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
+        """Force at every instant, of the reference and both sensors in m as the drive has them."""
+        real = self.real
+        states = {id(own): [0, 0, 0, 0] if self._fixed else [real(0)] * 4
+                  for own in (*self.setpoint, *self.current)}  # fmt: skip
+        last, total, found = real(motor[0]), real(0), []
+        for r, y, m in zip(reference, position, motor, strict=True):
+            v = real(self.Kv) * (real(r) - real(y))
+            for own in self.setpoint:
+                v = self._filtered(own, states[id(own)], v)
+            w = v - (real(m) - last) * real(self.rate)
+            last = real(m)
+            total = total + real(self.share) * w
+            u = real(self.Kp) * (w + total)
+            for own in self.current:
+                u = self._filtered(own, states[id(own)], u)
+            found.append(u)
+        return found
+
+    @property
+    def _fixed(self) -> bool:
+        return self.kind is Number.FIXED_30
+
+    def _filtered(self, own: tuple[Any, ...], state: list[Any], u: Any) -> Any:
+        """y_k of u_k; `state`: u and y of the two instants before."""
+        b0, b1, b2, a1, a2 = own
+        grain = self.options.grain
+        x = round(float(u) / grain) if self._fixed else u
+        y = b0 * x + b1 * state[0] + b2 * state[1] - a1 * state[2] - a2 * state[3]
+        if self._fixed:
+            y >>= self.options.bits
+        state[:] = [x, state[0], y, state[2]]
+        return self.real(y * grain) if self._fixed else y
+
+    def code(self, title: str) -> str:
+        """The same as one C99 file: `cascade_step(state, r, y, m)`."""
+        real = "float" if self.real is np.float32 else "double"
+        number = "int64_t" if self._fixed else real
+        suffix = "f" if real == "float" else ""
+
+        def value(x: Any) -> str:
+            return str(int(x)) if self._fixed else f"{float(x)!r}{suffix}"
+
+        rows = [f"    {{{', '.join(map(value, own))}}}" for own in (*self.setpoint, *self.current)]
+        count, n = len(rows), len(self.setpoint)
+        inside = ("x = llrint(u / GRAIN)", f"y >>= {self.options.bits}", "(real)(y * GRAIN)") \
+            if self._fixed else ("x = u", "", "y")  # fmt: skip
+        gains = [f"{float(g)!r}{suffix}" for g in (self.Kv, self.Kp, self.share, self.rate)]
+        return f"""/* {title}: position, velocity and filters of a drive, one call each period.
+   cc -std=c99 -O2 -ffp-contract=off; right shifts of negative integers are arithmetic. */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#define GRAIN {self.options.grain!r}
+typedef {real} real;
+typedef {number} number;
+typedef struct {{ real last, total; int begun; number old[{max(count, 1)}][4]; }} cascade_state;
+
+static const number FILTERS[{max(count, 1)}][5] = {{
+{("," + chr(10)).join(rows) or "    {0}"}
+}};
+
+static real filtered(const number *c, number *s, real u)
+{{
+    number {inside[0]};
+    number y = c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3];
+    {inside[1]};
+    s[1] = s[0]; s[0] = x; s[3] = s[2]; s[2] = y;
+    return {inside[2]};
+}}
+
+void cascade_reset(cascade_state *s) {{ memset(s, 0, sizeof *s); }}
+
+/* r, y: setpoint and sensor of the position, m: the motor's sensor, m; the force, N. */
+real cascade_step(cascade_state *s, real r, real y, real m)
+{{
+    real v = {gains[0]} * (r - y), w, u;
+    int i;
+    if (!s->begun) {{ s->last = m; s->begun = 1; }}
+    for (i = 0; i < {n}; i++) v = filtered(FILTERS[i], s->old[i], v);
+    w = v - (m - s->last) * {gains[3]};
+    s->last = m;
+    s->total = s->total + {gains[2]} * w;
+    u = {gains[1]} * (w + s->total);
+    for (i = {n}; i < {count}; i++) u = filtered(FILTERS[i], s->old[i], u);
+    return u;
+}}
+"""
+
+
+def program_of(
+    cascade: Cascade, values: Array, options: ArithmeticOptions = ArithmeticOptions()
+) -> Program:
+    """The program of a cascade with rounded values.
+
+    Parameters
+    ----------
+    cascade, values : Cascade, array (n,)
+        SI.
+    options : ArithmeticOptions
+
+    Returns
+    -------
+    Program
+    """
+    kind = cascade.drive.number
+    real = np.float32 if kind is Number.SINGLE else float
+    own: dict[str, list[tuple[Any, ...]]] = {"setpoint": [], "current": []}
+    for slot, block, part in zip(cascade.slots, cascade.filters, cascade.parts(values),
+                                 strict=True):  # fmt: skip
+        b, a = block.coefficients(part)
+        numbers = [*b.tolist(), *a[1:].tolist()]
+        if kind is Number.FIXED_30:
+            own[slot.place].append(tuple(round(c * 2**options.bits) for c in numbers))
+        else:
+            own[slot.place].append(tuple(real(c) for c in numbers))
+    Kv, Kp, Tn = (float(value) for value in values[:3])
+    share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
+    return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
+                   tuple(own["setpoint"]), tuple(own["current"]), options)  # fmt: skip

@@ -1,0 +1,192 @@
+"""A drive's cascade as one controller of the position and the motor's sensor.
+
+    v = F_s(z) Kv e,   w = v - (1 - 1/z)/T y_m,   u = F_c(z) Kp (1 + T/Tn 1/(1 - 1/z)) w
+
+e = r - y_p is the error of the position's sensor, y_m the motor's: its velocity is the difference
+of its counts. F_s are filters of the velocity setpoint, F_c those of the current command. As
+K = [K_p, K_m] both sensors' gains are tied by the same PI and filters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ccd_casadi.extensions.drives.drive import Drive, Setting, Slot
+from ccd_casadi.extensions.drives.forms import FORMS, Filter
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+Values = Sequence[float] | Array  # SI, in the order of the settings
+
+
+class Polynomials(NamedTuple):
+    """K as products of polynomials in 1/z: K_j = Π above_j/(Π below (1 - 1/z)), of which the
+    motor's is above times (1 - 1/z). Multiplied out they would lose digits next to z = 1."""
+
+    position: tuple[Array, ...]
+    velocity: tuple[Array, ...]
+    below: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Cascade:
+    """Which of a drive's blocks are used, and on which sensors.
+
+    Attributes
+    ----------
+    drive : Drive
+    period : float
+        T, s.
+    slots : tuple of Slot
+        The filters in use.
+    position, velocity, sensors : int
+        Numbers of the sensors of position and of velocity, and how many there are.
+    """
+
+    drive: Drive
+    period: float
+    slots: tuple[Slot, ...]
+    position: int
+    velocity: int
+    sensors: int
+
+    @cached_property
+    def settings(self) -> tuple[Setting, ...]:
+        """Every parameter, in the order of the values."""
+        own = self.drive.position, self.drive.velocity, self.drive.integral
+        filters = (slot.settings[k] for slot in self.slots for k in FORMS[slot.form].names)
+        return (*own, *filters)
+
+    @cached_property
+    def filters(self) -> tuple[Filter, ...]:
+        """The filters of the slots."""
+        rule, number = self.drive.rule, self.drive.number
+        return tuple(Filter(FORMS[slot.form], rule, number, self.period) for slot in self.slots)
+
+    @property
+    def ranges(self) -> Array:
+        """Least and largest values (2, n), SI; frequencies below half the rate."""
+        found = np.array([setting.range for setting in self.settings]).T
+        hertz = [setting.unit == "Hz" for setting in self.settings]
+        found[1, hertz] = np.minimum(found[1, hertz], 0.49 / self.period)
+        return found
+
+    def parts(self, values: Values) -> list[dict[str, float]]:
+        """The parameters of each filter by name."""
+        found, at = [], 3
+        for slot in self.slots:
+            names = FORMS[slot.form].names
+            own = [float(value) for value in values[at : at + len(names)]]
+            found.append(dict(zip(names, own, strict=True)))
+            at += len(names)
+        return found
+
+    def responses(self, values: Values, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """K (p, k) before coefficients are rounded, and ∂K/∂ln values (n, p, k)."""
+        Kv, Kp, Tn = (float(value) for value in values[:3])
+        away, n = 1.0 - 1.0 / z, len(self.settings)
+        lag = self.period / Tn / away
+        base = Kp * (1.0 + lag)
+        slopes = np.zeros((2, n, len(z)), complex)  # of ln of the motor's path, and the position's
+        slopes[1, 0] = slopes[:, 1] = 1.0
+        slopes[:, 2] = -lag / (1.0 + lag)
+        ahead, at = np.ones(len(z), complex), 3
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            F, steep = block.response(own, z)
+            slopes[1, at : at + len(steep)] = steep
+            if slot.place == "current":
+                base = base * F
+                slopes[0, at : at + len(steep)] = steep
+            else:
+                ahead = ahead * F
+            at += len(steep)
+        K, dK = np.zeros((self.sensors, len(z)), complex), np.zeros((n, self.sensors, len(z)),
+                                                                    complex)  # fmt: skip
+        for sensor, path, steep in ((self.velocity, base * away / self.period, slopes[0]),
+                                    (self.position, base * ahead * Kv, slopes[1])):  # fmt: skip
+            K[sensor] += path
+            dK[:, sensor] += path * steep
+        return K, dK
+
+    def polynomials(self, values: Values) -> Polynomials:
+        """K with its coefficients as the drive rounds them."""
+        Kv, Kp, Tn = (float(value) for value in values[:3])
+        PI = Kp * np.array([1.0 + self.period / Tn, -1.0])
+        above: dict[str, list[Array]] = {"current": [], "setpoint": []}
+        below: dict[str, list[Array]] = {"current": [], "setpoint": []}
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            b, a = block.coefficients(own)
+            above[slot.place].append(b)
+            below[slot.place].append(a)
+        return Polynomials(
+            (Kv * PI, *above["current"], *above["setpoint"]),
+            (PI / self.period, *above["current"], *below["setpoint"]),
+            (*below["current"], *below["setpoint"]),
+        )
+
+    def state_space(self, values: Values) -> StateSpace:
+        """K(z), errors of all sensors in, force out, coefficients as the drive rounds them."""
+        Kv, Kp, Tn = (float(value) for value in values[:3])
+        T = self.period
+        blocks = {"current": [], "setpoint": []}  # type: dict[str, list[StateSpace]]
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            blocks[slot.place].append(_second_order(*block.coefficients(own), T))
+        ahead = _of(Kv, T)
+        for one in blocks["setpoint"]:
+            ahead = _series(ahead, one)
+        # motor: w = (y_k - y_{k-1})/T
+        motor = StateSpace(np.zeros((1, 1)), np.ones((1, 1)), np.array([[-1.0 / T]]),
+                           np.array([[1.0 / T]]), period=T)  # fmt: skip
+        both = _beside(ahead, self.position, motor, self.velocity, self.sensors)
+        share = Kp * T / Tn
+        PI = StateSpace(np.eye(1), np.ones((1, 1)), np.array([[share]]), np.array([[Kp + share]]),
+                        period=T)  # fmt: skip
+        found = _series(both, PI)
+        for one in blocks["current"]:
+            found = _series(found, one)
+        return found
+
+    def require_fit(self, values: Values) -> None:
+        """Raise UserError where the drive's numbers do not hold a filter's coefficients."""
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            if not block.fits(own):
+                words = f"{slot.name}: a coefficient exceeds what {self.drive.number} holds"
+                raise UserError(f"{words}; use fewer of these filters, or a lower S_max")
+
+
+def _of(gain: float, T: float) -> StateSpace:
+    return StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[gain]]),
+                      period=T)  # fmt: skip
+
+
+def _second_order(b: Array, a: Array, T: float) -> StateSpace:
+    """The transposed direct form."""
+    return StateSpace(np.array([[-a[1], 1.0], [-a[2], 0.0]]),
+                      np.array([[b[1] - a[1] * b[0]], [b[2] - a[2] * b[0]]]),
+                      np.array([[1.0, 0.0]]), np.array([[b[0]]]), period=T)  # fmt: skip
+
+
+def _series(first: StateSpace, second: StateSpace) -> StateSpace:
+    zero = np.zeros((len(first.A), len(second.A)))
+    return StateSpace(
+        np.block([[first.A, zero], [second.B @ first.C, second.A]]),
+        np.vstack([first.B, second.B @ first.D]),
+        np.hstack([second.D @ first.C, second.C]),
+        second.D @ first.D,
+        period=first.period,
+    )
+
+
+def _beside(one: StateSpace, i: int, other: StateSpace, j: int, inputs: int) -> StateSpace:
+    """The sum of two systems on inputs i and j of all."""
+    n, m = len(one.A), len(other.A)
+    A, B, D = np.zeros((n + m, n + m)), np.zeros((n + m, inputs)), np.zeros((1, inputs))
+    A[:n, :n], A[n:, n:] = one.A, other.A
+    B[:n, i], B[n:, j] = one.B[:, 0], other.B[:, 0]
+    D[0, i] += one.D[0, 0]
+    D[0, j] += other.D[0, 0]
+    return StateSpace(A, B, np.hstack([one.C, other.C]), D, period=one.period)

@@ -1,0 +1,63 @@
+"""`python -m ccd_casadi.drive CASE.toml`: an industrial drive's cascade, rounded and proven."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from ccd_casadi.support.command_line import ExitCode, command, run_folder
+from ccd_casadi.support.options import integer, one_line, option, valued
+from ccd_casadi.support.terminal import inform, say
+
+
+@command(
+    "ccd_casadi.drive",
+    "Find the fastest cascade of the drive that [drive] names, round it as the drive rounds, judge "
+    "and prove it; write a sheet of its parameters, JSON and C code.",
+    option("--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"),
+    option("--today", metavar="FILE.toml", type=Path,
+           help="present values by number or name, shown beside the new ones"),
+    valued("--starts", "N", integer(1), "starting points of the search", 24),
+    needs=["ccd_casadi.extensions.drives.design", "ccd_casadi.cases.case_problem"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
+    """Design, write the folder, print the sheet."""
+    from dataclasses import replace
+
+    from ccd_casadi.cases.case import load_case, parse_theta, read_toml
+    from ccd_casadi.extensions.drives.arithmetic import program_of
+    from ccd_casadi.extensions.drives.design import DriveOptions, design_drive
+    from ccd_casadi.extensions.drives.of_case import drive_problem
+    from ccd_casadi.extensions.drives.sheet import entry, sheet_text
+    from ccd_casadi.reporting.facts import run_name
+    from ccd_casadi.support.errors import UserError
+    from ccd_casadi.support.json_files import write_json
+    from ccd_casadi.support.process_pool import Workers
+    from ccd_casadi.support.text import versions
+
+    case = load_case(options.case)
+    theta = None if options.theta is None else parse_theta(case, options.theta)
+    today = None if options.today is None else read_toml(options.today)
+    if today and not all(isinstance(value, (int, float)) for value in today.values()):
+        raise UserError(f'{options.today}: give numbers, as in "p1417" = 500')
+    problem = drive_problem(case, theta)
+    folder = run_folder(options.case, options.out)
+    search = replace(DriveOptions().search, starts=options.starts)
+    with Workers(options.workers) as workers:
+        found = design_drive(
+            problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
+            seed=options.seed, workers=workers, options=DriveOptions(search=search),
+        )  # fmt: skip
+    text = sheet_text(found, today)
+    (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
+    code = program_of(found.cascade, found.values).code(run_name(folder))
+    (folder / "cascade.c").write_text(code, "utf-8")
+    answer = entry(found) | {"seconds": options.seconds(), "seed": options.seed,
+                             "versions": versions()}  # fmt: skip
+    write_json(folder / "drive.json", answer)
+    inform(text)
+    inform(f"sheet         {folder / 'sheet.txt'}")
+    if found.status == "verified":
+        return ExitCode.DONE
+    reason = found.proof.words if found.certificate.passed else found.certificate.words
+    say(one_line(f"not verified: {reason}"), sys.stderr)
+    return ExitCode.NOT_VERIFIED

@@ -1,0 +1,161 @@
+"""A drive's cascade on a set of plants: searched, rounded, judged and proven."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ccd_casadi.extensions.drives.cascade import Cascade
+from ccd_casadi.extensions.drives.proof import prove_cascade
+from ccd_casadi.extensions.drives.rounding import RoundingOptions, on_the_grid
+from ccd_casadi.extensions.drives.search import Candidate, Search, SearchOptions
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """Numbers of a drive's design.
+
+    Attributes
+    ----------
+    draws : int
+        Plants that are drawn for the judge besides the corners.
+    rounds : int
+        Of search and proof: a plant that the proof finds is added.
+    lowered, lower : int, float
+        How often, and by which share, ω_b is lowered where the proof finds a slower plant.
+    search, rounding : SearchOptions, RoundingOptions
+    """
+
+    draws: int = 24
+    rounds: int = 3
+    lowered: int = 10
+    lower: float = 1e-3
+    search: SearchOptions = field(default_factory=SearchOptions)
+    rounding: RoundingOptions = field(default_factory=RoundingOptions)
+
+
+@dataclass(frozen=True)
+class DriveDesign:
+    """A cascade with its rounded values, and what is known of it.
+
+    Attributes
+    ----------
+    cascade : Cascade
+    values : array (n,)
+        On the drive's grid, SI.
+    bandwidth : float
+        ω_b in rad/s, for which the proof is.
+    free : Candidate
+        Before rounding.
+    certificate : SetCertificate
+        Of the rounded controller, on corners, draws and what the proof found.
+    proof : Proof
+        Of the rounded controller.
+    """
+
+    cascade: Cascade
+    values: Array
+    bandwidth: float
+    free: Candidate
+    certificate: SetCertificate
+    proof: Proof
+
+    @property
+    def status(self) -> str:
+        """verified: the judge passes it, and it is proven on the whole set."""
+        both = self.certificate.passed and self.proof.proven
+        return "verified" if both else "not_verified"
+
+    @property
+    def controller(self) -> StateSpace:
+        """K(z) of errors of all sensors."""
+        return self.cascade.state_space(self.values)
+
+
+def design_drive(
+    cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, *,
+    seed: int = 0, workers: Pool | None = None, options: DriveOptions = DriveOptions(),
+) -> DriveDesign:  # fmt: skip
+    """Find the fastest rounded cascade.
+
+    Parameters
+    ----------
+    cascade, uncertain, bounds, sampling : Cascade, UncertainPlant, Bounds, Sampling
+    seed : int
+    workers : Pool, optional
+        For the judge.
+    options : DriveOptions
+
+    Returns
+    -------
+    DriveDesign
+
+    Raises
+    ------
+    UserError
+        No start is stable within the drive's limits, or none meets the bounds.
+    """
+    require_known(bounds)
+    points = _first(uncertain)
+    search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
+    free = search.fastest(seed)
+    if free is None:
+        words = "no cascade of this drive meets the bounds from any start"
+        raise UserError(f"{words}; raise S_max or S_low, or give it more filters")
+    for _ in range(options.rounds):
+        rounded = on_the_grid(search, free, options.rounding)
+        judged = judge(cascade, rounded.values, uncertain, bounds, sampling, points, seed, workers,
+                       options.draws)  # fmt: skip
+        band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
+        proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
+        for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
+            if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):
+                break
+            band *= 1.0 - options.lower
+            proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
+        if not proof.refuted:
+            break
+        points = [*points, (proof.option, np.array(proof.point))]
+        search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
+        free = search.settled(free)
+    cascade.require_fit(rounded.values)
+    return DriveDesign(cascade, rounded.values, band, free, judged, proof)
+
+
+def judge(
+    cascade: Cascade, values: Array, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling,
+    points: list[tuple[int, Array]], seed: int = 0, workers: Pool | None = None, draws: int = 24,
+) -> SetCertificate:  # fmt: skip
+    """Certify values on the plants of points and draws, by the matrices as they are written."""
+    drawn = uncertain.drawn(np.random.default_rng([seed, draws]), draws)
+    plants = uncertain.as_written([*points, *drawn])
+    K = cascade.state_space(values)
+    return certify(plants, K, bounds, sampling, integrator=True, workers=workers)
+
+
+def require_known(bounds: Bounds) -> None:
+    """Raise UserError for bounds that a drive's design has no rows of."""
+    for key in ("weighted_level", "compliance_max"):
+        if getattr(bounds, key) is not None:
+            raise UserError(f"{key} does not go with [drive] yet; leave it out")
+
+
+def _first(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+    """The corners, and between the model and each of them half way."""
+    corners = uncertain.corners()
+    middle = uncertain.nominal
+    between = [(option, 0.5 * (point + middle)) for option, point in corners
+               if (point != middle).any()]  # fmt: skip
+    return [*corners, *between]
+
+
+def _plants(uncertain: UncertainPlant, points: list[tuple[int, Array]]) -> list[StateSpace]:
+    return [uncertain.plant(point, option).plant_si() for option, point in points]

@@ -1,0 +1,100 @@
+"""What `ccd drive` designs: the cascade, plants and bounds of a case with [drive]."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.cases.case import Case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.checks import CaseError
+from ccd_casadi.cases.controller_tables import DriveTable
+from ccd_casadi.extensions.drives.cascade import Cascade
+from ccd_casadi.extensions.drives.design import require_known
+from ccd_casadi.extensions.drives.drive import Slot, read_drive
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class DriveProblem:
+    """A cascade, the plants that it drives and what its loops have to keep."""
+
+    cascade: Cascade
+    uncertain: UncertainPlant
+    bounds: Bounds
+    sampling: Sampling
+
+
+def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProblem:
+    """The problem of a case at a θ, or at its start.
+
+    Parameters
+    ----------
+    case : Case
+    theta : sequence of float, optional
+
+    Returns
+    -------
+    DriveProblem
+
+    Raises
+    ------
+    UserError
+        What does not go with a drive.
+    """
+    table = case.drive
+    if table.name is None:
+        words = "drive.name: is missing; add a table [drive] with the drive's name"
+        raise CaseError(f"{case.path}: {words}")
+    try:
+        drive = read_drive(table.name, case.path.parent)
+        if drive.loop != "cascade":
+            words = f"{drive.title} has no cascade; its PID is not designed yet"
+            raise UserError(f"{words}: use `ccd tune`, or another drive")
+        problem = problem_of(replace(case, drive=DriveTable()))
+        if not isinstance(problem.controller, StructuredProblem):
+            raise UserError('controller.structure is not "sections"; a drive needs that')
+        if problem.sampling is None:
+            raise UserError("loop.rate_hz is missing; a drive is sampled, give its rate")
+        bounds = bounds_of(problem)
+        require_known(bounds)
+        filters: list[Slot] = []
+        for place, count in (("current", table.filters), ("setpoint", table.setpoint_filters)):
+            there = drive.places(place)
+            if count > len(there):
+                words = f"has {len(there)} filters of the {place}, not {count}"
+                raise UserError(f"{drive.title} {words}; use that many at most")
+            filters += there[:count]
+        position, velocity, count = _sensors(bounds, table.velocity)
+        cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count)
+        uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
+    except CaseError:
+        raise
+    except UserError as error:
+        raise CaseError(f"{case.path}: drive: {error}") from None
+    return DriveProblem(cascade, uncertain, bounds, problem.sampling)
+
+
+def _sensors(bounds: Bounds, velocity: str | None) -> tuple[int, int, int]:
+    """The sensors of position and of velocity, and how many there are."""
+    if bounds.error is None:
+        if velocity is not None:
+            words = f"velocity is {velocity!r}, and there is one sensor"
+            raise UserError(f"{words}; give channels and controller.bandwidth_of, or drop it")
+        return 0, 0, 1
+    sensors = bounds.channels[:-1]
+    names = [one.name for one in sensors]
+    if not all(np.count_nonzero(one.output) == 1 and max(one.output) == 1.0 for one in sensors):
+        raise UserError("channels mix sensors; a drive takes each by itself: outputs = [1, 0]")
+    if velocity not in names:
+        there = ", ".join(names)
+        raise UserError(f"velocity is {velocity!r}; name the motor's channel, one of {there}")
+    order = [one.output.index(1.0) for one in sensors]
+    if order != list(range(len(order))):
+        raise UserError("channels are not in the order of the plant's outputs; reorder them")
+    return bounds.error, names.index(velocity), len(names)

@@ -1,0 +1,394 @@
+"""The fastest cascade within its bounds: steps of linear programmes on the parameters' logarithms.
+
+Rows are ln of |S| over its bound at every place, on a grid of frequencies, for some plants. ω_b is
+one more variable, which the shape's rows hold back. A step solves
+
+    max ln ω_b - ρ σ    s.t.  c + ∇c p <= σ,  |p| <= Δ,  0 <= σ
+
+with the exact slopes of the drive's own difference equations, and counts where the merit grows and
+every plant's loop stays stable. Fixed parameters do not move: so a rounded one is kept while the
+others make up for it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linprog
+
+from ccd_casadi.extensions.drives.cascade import Cascade
+from ccd_casadi.extensions.drives.forms import Filter, Number
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.text import HZ
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Numbers of the search.
+
+    Attributes
+    ----------
+    starts, stages, steps : int, tuple of (float, int), int
+        Starting points; steps from each, and the share of them that is kept then; steps from these.
+    refinements, finer : int, int
+        Of the grid by the peaks between its points, and points of the finer one to one of its.
+    alert, missed, met : float
+        Share below a bound from which on a peak is added, and by how much it exceeds the grid's
+        values beside it; ln of a figure over its bound that counts as met.
+    points : int
+        Of the grid of frequencies, as many again spread evenly; more lie about resonances.
+    lowest, last : float
+        Of the grid, over ω_low and over half the sampling rate.
+    penalty : float
+        ρ, per violation of one (natural) logarithm.
+    radius, least_radius, grow, shrink : float
+        Δ at first and at the end, and how it changes.
+    rows, violated : int, float
+        Rows that a programme begins with, and by which it grows; the least violation of one.
+    room : float
+        Share of every bound that is kept for what lies between the grid's points.
+    dampings, frequencies : tuple of float
+        Of the filters at a start: numerator and denominator damping, and Hz.
+    spread : float
+        Of gains at a start, in logarithms.
+    retreats : int
+        Halvings of a start's gains until every loop is stable.
+    gains : float
+        Kv over the frequency of the first bandwidth that is tried; Kp over mass times it.
+    bandwidth : float
+        Hz, of a start.
+    highest : float
+        Frequency of a filter over the sampling rate: next to half of it features are narrow.
+    difference : float
+        Of logarithms, for the slopes of fixed-point coefficients.
+    least_damping : float
+        Of a filter's denominator: below it a filter is a needle.
+    """
+
+    starts: int = 24
+    stages: tuple[tuple[float, int], ...] = ((0.5, 50), (0.1, 50))
+    steps: int = 40
+    refinements: int = 10
+    finer: int = 8
+    alert: float = 5e-3
+    missed: float = 5e-5
+    last: float = 0.999999
+    met: float = 4e-4
+    points: int = 200
+    lowest: float = 0.2
+    penalty: float = 30.0
+    radius: float = 0.3
+    least_radius: float = 1e-5
+    grow: float = 1.6
+    shrink: float = 0.4
+    rows: int = 60
+    violated: float = 1e-6
+    room: float = 5e-4
+    dampings: tuple[float, float] = (0.6, 0.65)
+    frequencies: tuple[float, float] = (80.0, 2500.0)
+    spread: float = 0.3
+    retreats: int = 10
+    gains: float = 1.0
+    bandwidth: float = 15.0
+    highest: float = 0.4
+    difference: float = 1e-5
+    least_damping: float = 0.1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Values of a cascade's parameters, ω_b in rad/s, and the largest ln of a figure over its
+    bound."""
+
+    values: Array
+    bandwidth: float
+    excess: float
+
+
+class Search:
+    """Rows of a cascade on some plants.
+
+    Parameters
+    ----------
+    cascade, bounds, sampling : Cascade, Bounds, Sampling
+    plants : sequence of StateSpace
+        SI, continuous.
+    options : SearchOptions
+    """
+
+    def __init__(
+        self, cascade: Cascade, bounds: Bounds, sampling: Sampling, plants: Sequence[StateSpace],
+        options: SearchOptions = SearchOptions(),
+    ) -> None:  # fmt: skip
+        self.cascade, self.bounds, self.options = cascade, bounds, options
+        T = sampling.period
+        self.systems = [sampled(plant, T, sampling.delay) for plant in plants]
+        rates = np.concatenate([np.abs(plant.rates) for plant in plants])
+        near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
+        about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
+        top, self.period = options.last * np.pi / T, T
+        grid = np.geomspace(options.lowest * bounds.omega_low, top, options.points)
+        even = np.linspace(0.0, top, options.points)[1:]
+        parts = [grid, even, about[about < top], np.array([bounds.omega_low])]
+        self.on(np.unique(np.concatenate(parts)))
+        ranges = cascade.ranges.copy()
+        for i, setting in enumerate(cascade.settings):
+            if "denominator" in setting.name and not setting.unit:
+                ranges[0, i] = max(ranges[0, i], options.least_damping)
+        hertz = [setting.unit == "Hz" for setting in cascade.settings]
+        ranges[1, hertz] = np.minimum(ranges[1, hertz], options.highest / T)
+        self.low, self.high = np.log(ranges)
+        self.mass = self._mass(plants[0])
+
+    def on(self, omega: Array) -> None:
+        """Take another grid of frequencies."""
+        self.omega, self.z = omega, np.exp(1j * omega * self.period)
+        self.G = [system.swept(omega)[:, :, 0].T for system in self.systems]
+
+    def _mass(self, plant: StateSpace) -> float:
+        """kg that the force moves as seen by the position's sensor, by G at ω_low."""
+        w = self.bounds.omega_low
+        G = plant.at(1j * np.array([w]))[0, self.cascade.position, 0]
+        return float(1.0 / (abs(G) * w * w))
+
+    def stable(self, values: Array) -> bool:
+        """Whether every plant's loop is."""
+        K = self.cascade.state_space(values)
+        for G in self.systems:
+            A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+            if not np.abs(np.linalg.eigvals(A)).max() < 1.0 - 1e-9:
+                return False
+        return True
+
+    def rows(self, kappa: Array, log_band: float) -> tuple[Array, Array]:
+        """c (m,) and ∇c (m, n + 1) to the parameters' logarithms and ln ω_b."""
+        b, w = self.bounds, self.omega
+        K, dK = self.cascade.responses(np.exp(kappa), self.z)
+        x = w / np.exp(log_band)
+        above = x > 1.0
+        if b.shape is not None:
+            room = b.room(x)
+            shape = np.log(room * x / np.sqrt(2.0))
+            by_x = 1.0 + np.where(above & b.opens, 2.0 * (b.shape - 1.0) / x**2 / room, 0.0)
+        else:
+            shape, by_x = np.where(above, np.inf, -0.5 * np.log(2.0)), 0.0 * x
+        own = {c.name: c.S_max or b.S_max for c in b.channels}
+        values, slopes = [], []
+        for G in self.G:
+            L, dL = G * K, G * dK
+            D, dD = 1.0 + L.sum(axis=0), dL.sum(axis=1)
+            for place in self._places():
+                rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
+                N, dN = 1.0 + L[rest].sum(axis=0), dL[:, rest].sum(axis=1)
+                S, dS = np.log(np.abs(N / D)), (dN / N - dD / D).real.T
+                name = "actuator" if place is None else self._name(place)
+                values.append(S - np.log(own.get(name, b.S_max)))
+                slopes.append(np.column_stack([dS, 0.0 * x]))
+                if place == self.cascade.position:
+                    values.append(S - shape)
+                    slopes.append(np.column_stack([dS, by_x]))
+                    at = int(np.searchsorted(w, b.omega_low))
+                    values.append(S[at : at + 1] - np.log(b.S_low))
+                    slopes.append(np.append(dS[at], 0.0)[None])
+        if self.cascade.drive.number is Number.FIXED_30:
+            for value, slope in self._coefficients(kappa):
+                values.append(value)
+                slopes.append(slope)
+        c = np.concatenate(values) + self.options.room
+        good = np.isfinite(c)
+        return c[good], np.concatenate(slopes)[good]
+
+    def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
+        """ln of the largest coefficient of each filter over what fixed point holds, by central
+        differences: it is a function of four numbers."""
+        h, at, found = self.options.difference, 3, []
+        blocks = self.cascade.filters
+        for slot, block in zip(self.cascade.slots, blocks, strict=True):
+            names = list(slot.settings)
+
+            def most(own: Array, block: Filter = block, names: list[str] = names) -> float:
+                values = dict(zip(names, np.exp(own).tolist(), strict=True))
+                b, a = block.coefficients(values)
+                return float(np.log(max(np.abs(b).max(), np.abs(a).max()) / block.largest_fixed))
+
+            own = kappa[at : at + len(names)]
+            slope = np.zeros((1, len(kappa) + 1))
+            for i, step in enumerate(h * np.eye(len(names))):
+                slope[0, at + i] = (most(own + step) - most(own - step)) / (2.0 * h)
+            found.append((np.array([most(own)]), slope))
+            at += len(names)
+        return found
+
+    def _places(self) -> list[int | None]:
+        """Sensors that count, and None for the actuator."""
+        used = {self.cascade.position, self.cascade.velocity}
+        return [*sorted(used)] if len(used) == 1 else [*sorted(used), None]
+
+    def _name(self, sensor: int) -> str:
+        return self.bounds.channels[sensor].name if self.bounds.channels else ""
+
+    def start(self, rng: np.random.Generator) -> Array | None:
+        """Values at which every loop is stable, filters next to 1; None where none was found."""
+        o, unit = self.options, self.options.bandwidth * HZ
+        low, high = np.log(o.frequencies)
+        gains = np.array([o.gains * unit * 4.0, self.mass * unit * 6.0]) * np.exp(
+            o.spread * rng.standard_normal(2)
+        )
+        values = [*gains, 1.0 / unit * 4.0]
+        for slot in self.cascade.slots:
+            f = float(np.exp(rng.uniform(low, high)))
+            own = {"f_Z": f, "f_N": f * 1.02, "f": f, "D_Z": o.dampings[0], "D_N": o.dampings[1],
+                   "D": o.dampings[1]}  # fmt: skip
+            values += [own[name] for name in slot.settings]
+        kappa = np.clip(np.log(values), self.low, self.high)
+        for _ in range(o.retreats):
+            if self.stable(np.exp(kappa)):
+                return np.exp(kappa)
+            kappa[:2] -= 0.3, 0.5
+        return None
+
+    def climb(
+        self, values: Array, fixed: np.ndarray | None = None, steps: int | None = None,
+        bandwidth: float | None = None,
+    ) -> Candidate:  # fmt: skip
+        """The best values that steps from a stable start find; `fixed` ones stay."""
+        o = self.options
+        kappa = np.log(values)
+        first = o.bandwidth * HZ if bandwidth is None else bandwidth
+        here, radius = np.append(kappa, np.log(first)), o.radius
+        low, high = np.append(self.low, -np.inf), np.append(self.high, np.inf)
+        free = np.ones(len(here), bool)
+        if fixed is not None:
+            free[:-1] = ~fixed
+        low, high = np.where(free, low, here), np.where(free, high, here)
+        here = np.clip(here, low, high)
+        c, J = self.rows(here[:-1], here[-1])
+        merit = -here[-1] + o.penalty * max(0.0, c.max())
+        for _ in range(steps or o.steps):
+            n = len(here)
+            ends = np.maximum(-radius, low - here), np.minimum(radius, high - here)
+            step = self._step(c, J, *ends)
+            if step is None:
+                break
+            there = np.clip(here + step[:n], low, high)
+            promised = merit - (-there[-1] + o.penalty * step[n])
+            if promised < 1e-7:
+                break
+            c_new, J_new = self.rows(there[:-1], there[-1])
+            gain = merit - (-there[-1] + o.penalty * max(0.0, c_new.max()))
+            if gain > 0.0 and not self.stable(np.exp(there[:-1])):
+                gain = -1.0
+            if gain > 0.0:
+                here, c, J, merit = there, c_new, J_new, merit - gain
+            if gain > 0.7 * promised:
+                radius = min(1.0, o.grow * radius)
+            elif gain < 0.25 * promised:
+                radius *= o.shrink
+            if radius < o.least_radius:
+                break
+        return Candidate(np.exp(here[:-1]), float(np.exp(here[-1])), float(c.max()))
+
+    def _step(self, c: Array, J: Array, low: Array, high: Array) -> Array | None:
+        """p and σ of one programme, its rows added as they are violated; None where it failed."""
+        o, n = self.options, len(low)
+        cost, bounds = np.zeros(n + 1), [*zip(low, high, strict=True), (0.0, None)]
+        cost[n - 1], cost[n] = -1.0, o.penalty
+        used = np.zeros(len(c), bool)
+        used[np.argsort(-c)[: o.rows]] = True
+        while True:
+            A = np.column_stack([J[used], -np.ones(used.sum())])
+            found = linprog(cost, A_ub=A, b_ub=-c[used], bounds=bounds, method="highs")
+            if found.x is None:
+                return None
+            over = np.where(used, -np.inf, c + J @ found.x[:n] - found.x[n])
+            if over.max() < o.violated:
+                return np.asarray(found.x)
+            worst = np.argsort(-over)[: o.rows]
+            used[worst[over[worst] > o.violated]] = True
+
+    def fastest(self, seed: int = 0) -> Candidate | None:
+        """The best of several starts; None where no start is stable or none meets the bounds."""
+        o, rng = self.options, np.random.default_rng(seed)
+        starts = [values for _ in range(o.starts) if (values := self.start(rng)) is not None]
+        left = [Candidate(values, o.bandwidth * HZ, 0.0) for values in starts]
+        others: list[Candidate] = []
+        for share, steps in o.stages:
+            left = [self.climb(one.values, None, steps, one.bandwidth) for one in left]
+            left.sort(key=lambda one: max(one.excess, 0.0) * o.penalty - np.log(one.bandwidth))
+            left, others = left[: (n := max(1, round(share * len(starts))))], left[n:]
+        found = [self.settled(one) for one in left]
+        for one in others:  # where none of the best meets the bounds between the grid's points
+            if any(made.excess < o.met for made in found):
+                break
+            found.append(self.settled(one))
+        good = [one for one in found if one.excess < o.met]
+        return max(good, key=lambda one: one.bandwidth, default=None)
+
+    def settled(self, candidate: Candidate, fixed: np.ndarray | None = None) -> Candidate:
+        """Steps from a candidate on, with the peaks that lie between the grid's points added."""
+        found = candidate
+        for _ in range(self.options.refinements):
+            found = self.climb(found.values, fixed, bandwidth=found.bandwidth)
+            if not self.refine(found.values):
+                break
+        bandwidth, excess = self.judged(found.values)
+        return Candidate(found.values, bandwidth, excess)
+
+    def refine(self, values: Array) -> bool:
+        """Add to the grid where |S| peaks above its bounds between its points."""
+        coarse, T, o = self.omega, self.period, self.options
+        fine = np.exp(np.interp(
+            np.arange((len(coarse) - 1) * o.finer + 1) / o.finer, np.arange(len(coarse)),
+            np.log(coarse),
+        ))  # fmt: skip
+        K = self.cascade.responses(values, np.exp(1j * fine * T))[0]
+        new: list[float] = []
+        for system in self.systems:
+            L = system.swept(fine)[:, :, 0].T * K
+            for _, S, limit in self._figures(L):
+                cells = S[:-1].reshape(-1, o.finer)
+                ends = np.maximum(S[: -o.finer : o.finer], S[o.finer :: o.finer])
+                top = cells.max(axis=1)
+                high = (top > ends * (1.0 + o.missed)) & (top > limit * (1.0 - o.alert))
+                at = cells.argmax(axis=1) + o.finer * np.arange(len(cells))
+                new += fine[at[high]].tolist()
+        if not new:
+            return False
+        self.on(np.union1d(coarse, new))
+        return True
+
+    def judged(self, values: Array) -> tuple[float, float]:
+        """ω_b by the shape, and the largest ln of a peak over its bound, on the grid."""
+        K, b = self.cascade.responses(values, self.z)[0], self.bounds
+        bandwidth, worst = np.inf, -np.inf
+        for G in self.G:
+            for place, S, limit in self._figures(G * K):
+                worst = max(worst, float(np.log(S.max() / limit)))
+                if place == self.cascade.position:
+                    bandwidth = min(bandwidth, self._band(S))
+                    low = S[np.searchsorted(self.omega, b.omega_low)]
+                    worst = max(worst, float(np.log(low / b.S_low)))
+        return bandwidth, worst + self.options.room
+
+    def _band(self, S: Array) -> float:
+        """The largest ω_b that |S| on the grid allows."""
+        if self.bounds.shape is not None:
+            x = self.bounds.reached(np.sqrt(2.0) * S)
+            return float((self.omega / x).min())
+        over = np.flatnonzero(2.0 * S**2 > 1.0)
+        return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
+
+    def _figures(self, L: np.ndarray) -> list[tuple[int | None, Array, float]]:
+        """|S| at every place by its loops L (p, k), and its bound."""
+        D, b = np.abs(1.0 + L.sum(axis=0)), self.bounds
+        own = {c.name: c.S_max or b.S_max for c in b.channels}
+        found = []
+        for place in self._places():
+            rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
+            name = "actuator" if place is None else self._name(place)
+            S = np.abs(1.0 + L[rest].sum(axis=0)) / D
+            found.append((place, S, float(own.get(name, b.S_max))))
+        return found

@@ -1,0 +1,61 @@
+"""The sheet that a person types into a drive: numbers, names, values, units; as text and JSON."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ccd_casadi.extensions.drives.design import DriveDesign
+from ccd_casadi.support.text import HZ
+
+
+def sheet_rows(design: DriveDesign) -> list[dict[str, Any]]:
+    """One entry for each parameter, in the drive's unit."""
+    rows = []
+    for setting, value in zip(design.cascade.settings, design.values.tolist(), strict=True):
+        shown = setting.shown(round(value * setting.per_si / setting.step))
+        rows.append({"number": setting.number, "name": setting.name, "value": shown,
+                     "unit": setting.unit})  # fmt: skip
+    return rows
+
+
+def entry(design: DriveDesign) -> dict[str, Any]:
+    """Everything that is known, as JSON holds it."""
+    drive, judged, bounds = design.cascade.drive, design.certificate, design.certificate.worst
+    return {
+        "status": design.status,
+        "drive": drive.title,
+        "rate_hz": 1.0 / design.cascade.period,
+        "bandwidth_hz": design.bandwidth / HZ,
+        "free_bandwidth_hz": design.free.bandwidth / HZ,
+        "judge": {"passed": judged.passed, "words": judged.words, "plants": len(judged.plants),
+                  "shares": bounds},
+        "proof": {"proven": design.proof.proven, "words": design.proof.words,
+                  "levels": design.proof.levels, "slack": design.proof.slack},
+        "parameters": sheet_rows(design),
+        "sources": list(drive.sources),
+        "chosen": list(drive.chosen),
+        "unknown": list(drive.unknown),
+    }  # fmt: skip
+
+
+def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) -> str:
+    """The sheet as text, `today`'s values by number or name beside the new ones."""
+    rows, given = sheet_rows(design), today or {}
+    head = ["number", "parameter", "new", "unit"] if today is None else [
+        "number", "parameter", "today", "new", "unit"]  # fmt: skip
+    lines = [head]
+    for row in rows:
+        old = given.get(row["name"], given.get(row["number"]) if row["number"] else None)
+        before = [] if today is None else ["" if old is None else f"{old:.10g}"]
+        lines.append([row["number"], row["name"], *before, f"{row['value']:.10g}", row["unit"]])
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    table = ["  ".join(part.ljust(width) for part, width in zip(line, widths, strict=True)).rstrip()
+             for line in lines]  # fmt: skip
+    drive = design.cascade.drive
+    found = [drive.title, *table, ""]
+    rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
+    found.append(f"bandwidth     {rounded:.4g} Hz; {free:.4g} Hz before rounding, on fewer plants")
+    found.append(f"judged        {design.certificate.words}")
+    found.append(f"proof         {design.proof.words}")
+    found += [f"chosen        {words}" for words in drive.chosen]
+    found += [f"not known     {words}" for words in drive.unknown]
+    return "\n".join(found)

@@ -1,0 +1,68 @@
+"""`ccd drive` and [drive] in a case: what is written, and what is refused by name."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccd_casadi.cases.case import parse_case, read_toml
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.drive import main
+from ccd_casadi.extensions.drives.of_case import drive_problem
+from ccd_casadi.support.errors import UserError
+
+EXAMPLE = Path(__file__).parents[2] / "examples/drive_bench/case.toml"
+
+
+def changed(**tables: dict[str, Any]) -> dict[str, Any]:
+    data = read_toml(EXAMPLE)
+    for name, table in tables.items():
+        data[name] = {**data.get(name, {}), **table}
+    return data
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"drive": {"name": "sinamics"}}, "beckhoff_ax5000"),
+        ({"drive": {"name": "pi_e727"}}, "its PID is not designed"),
+        ({"drive": {"filters": 5}}, "has 4 filters of the current"),
+        ({"drive": {"velocity": "spindle"}}, "one of motor, load"),
+        ({"controller": {"compliance_max": 1e-5}}, "compliance_max"),
+    ],
+)
+def test_what_does_not_go_with_a_drive_is_named(
+    tables: dict[str, dict[str, Any]], words: str
+) -> None:
+    with pytest.raises(UserError, match=words):
+        drive_problem(parse_case(changed(**tables), EXAMPLE))
+
+
+def test_other_commands_refuse_a_case_with_a_drive() -> None:
+    with pytest.raises(UserError, match="ccd drive"):
+        problem_of(parse_case(read_toml(EXAMPLE), EXAMPLE))
+
+
+def test_the_command_writes_a_sheet_and_says_what_is_proven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    today = tmp_path / "today.toml"
+    today.write_text('p1417 = 500\n"speed controller P gain Kp" = 12\n', "utf-8")
+    text = EXAMPLE.read_text("utf-8").replace("filters = 3", "filters = 1", 1)
+    plant = f"function = {str(EXAMPLE.parent / 'plant.py') + ':bench'!r}"
+    text = text.replace('function = "plant.py:bench"', plant).replace("S_low = 0.1", "S_low = 0.3")
+    case = tmp_path / "case.toml"
+    case.write_text(text, "utf-8")
+    out = tmp_path / "run"
+    code = main([str(case), "--starts", "2", "--today", str(today), "--out", str(out)])
+    answer = json.loads((out / "drive.json").read_text())
+    assert code == (0 if answer["status"] == "verified" else 4)
+    assert (answer["status"] == "verified") == (
+        answer["judge"]["passed"] and answer["proof"]["proven"]
+    )
+    assert len(answer["parameters"]) == 11
+    sheet = (out / "sheet.txt").read_text("utf-8")
+    assert "p1417" in sheet
+    assert "500" in sheet
+    assert "cascade_step" in (out / "cascade.c").read_text("utf-8")
