@@ -251,6 +251,11 @@ class DriveTable:
     velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
     filters: int = key("filters of the current command in use", 3, check=checks.count(0))
     setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
+    filter_gain: float = key(
+        "what all filters on a sensor's way may raise at any frequency, over their gain at rest",
+        10.0,
+        check=checks.number(1.0, 1e6, "give 1 to 1e6", closed=True),
+    )
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def bounds(S_max: float = 2.0, **other: object) -> Bounds:
 def cascade(name: str = "generic", current: int = 1, setpoint: int = 1) -> Cascade:
     drive = read_drive(name)
     slots = (*drive.places("current")[:current], *drive.places("setpoint")[:setpoint])
-    return Cascade(drive, RATE.period, slots, 1, 0, 2)
+    return Cascade(drive, RATE.period, slots, 1, 0, 2, filter_gain=3.0)
 
 
 # Kv, Kp, Tn and two filters: 40 Hz with |S| below 2.5 everywhere on the set

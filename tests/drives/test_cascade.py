@@ -146,7 +146,13 @@ def test_a_design_is_on_the_grid_verified_and_proven() -> None:
         steps = value * setting.per_si / setting.step
         assert abs(steps - round(steps)) < 1e-6 * max(1.0, abs(steps)), setting.name
         assert setting.range[0] <= value <= setting.range[1] * (1.0 + 1e-12)
+        if setting.unit == "Hz":  # no filter takes the place of the PI
+            assert value >= found.bandwidth / HZ - setting.step
     omega = np.geomspace(1.0, 0.9999 * np.pi / RATE.period, 5000)
+    z = np.exp(1j * omega * RATE.period)
+    parts = zip(found.cascade.parts(found.values), found.cascade.filters, strict=True)
+    current, setpoint = (np.abs(block.response(own, z)[0]) for own, block in parts)
+    assert max(current.max(), (current * setpoint).max()) <= 3.0
     plant = uncertain().plant(np.array([0.03])).plant_si()
     G = sampled(plant, RATE.period, RATE.delay).swept(omega)[:, :, 0].T
     L = G * found.controller.swept(omega)[:, 0].T

@@ -45,6 +45,9 @@ class Cascade:
         The filters in use.
     position, velocity, sensors : int
         Numbers of the sensors of position and of velocity, and how many there are.
+    filter_gain : float
+        What all filters on a sensor's way may raise at any frequency, relative to their gain at
+        rest: without a limit they become leads that amplify noise.
     """
 
     drive: Drive
@@ -53,6 +56,7 @@ class Cascade:
     position: int
     velocity: int
     sensors: int
+    filter_gain: float = np.inf
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:
@@ -111,6 +115,19 @@ class Cascade:
             K[sensor] += path
             dK[:, sensor] += path * steep
         return K, dK
+
+    def rises(self, values: Values, z: np.ndarray) -> tuple[Array, Array]:
+        """ln of the gain of all filters behind the motor's sensor and behind the position's (2, k),
+        and its slopes to ln values (n, 2, k)."""
+        found, slopes = np.zeros((2, len(z))), np.zeros((len(self.settings), 2, len(z)))
+        at = 3
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            F, steep = block.response(own, z)
+            ways = slice(0, 2) if slot.place == "current" else slice(1, 2)
+            found[ways] += np.log(np.abs(F))
+            slopes[at : at + len(steep), ways] += steep.real[:, None]
+            at += len(steep)
+        return found, slopes
 
     def polynomials(self, values: Values) -> Polynomials:
         """K with its coefficients as the drive rounds them."""

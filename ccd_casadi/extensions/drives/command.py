@@ -59,5 +59,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if found.status == "verified":
         return ExitCode.DONE
     reason = found.proof.words if found.certificate.passed else found.certificate.words
+    if found.rise > found.cascade.filter_gain:
+        reason = f"filters raise their gain to {found.rise:.4g}, above filter_gain"
     say(one_line(f"not verified: {reason}"), sys.stderr)
     return ExitCode.NOT_VERIFIED

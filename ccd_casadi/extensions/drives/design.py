@@ -29,6 +29,8 @@ class DriveOptions:
         Plants that are drawn for the judge besides the corners.
     rounds : int
         Of search and proof: a plant that the proof finds is added.
+    rise_points : int
+        Frequencies up to half the rate at which the filters' gain is checked.
     lowered, lower : int, float
         How often, and by which share, ω_b is lowered where the proof finds a slower plant.
     search, rounding : SearchOptions, RoundingOptions
@@ -38,6 +40,7 @@ class DriveOptions:
     rounds: int = 3
     lowered: int = 10
     lower: float = 1e-3
+    rise_points: int = 20_000
     search: SearchOptions = field(default_factory=SearchOptions)
     rounding: RoundingOptions = field(default_factory=RoundingOptions)
 
@@ -71,8 +74,15 @@ class DriveDesign:
     @property
     def status(self) -> str:
         """verified: the judge passes it, and it is proven on the whole set."""
-        both = self.certificate.passed and self.proof.proven
-        return "verified" if both else "not_verified"
+        whole = self.certificate.passed and self.proof.proven
+        whole = whole and self.rise <= self.cascade.filter_gain
+        return "verified" if whole else "not_verified"
+
+    @property
+    def rise(self) -> float:
+        """What all filters on a sensor's way raise at most, relative to their gain at rest."""
+        turn = np.linspace(0.0, np.pi, DriveOptions().rise_points)[1:]
+        return float(np.exp(self.cascade.rises(self.values, np.exp(1j * turn))[0].max()))
 
     @property
     def controller(self) -> StateSpace:

@@ -71,7 +71,8 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
                 raise UserError(f"{drive.title} {words}; use that many at most")
             filters += there[:count]
         position, velocity, count = _sensors(bounds, table.velocity)
-        cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count)
+        cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
+                          table.filter_gain)  # fmt: skip
         uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
     except CaseError:
         raise

@@ -64,8 +64,9 @@ class SearchOptions:
         Frequency of a filter over the sampling rate: next to half of it features are narrow.
     difference : float
         Of logarithms, for the slopes of fixed-point coefficients.
-    least_damping : float
-        Of a filter's denominator: below it a filter is a needle.
+    least_damping, most_damping : float, float
+        Of a filter's denominator, below which a filter is a needle; of all, above which it is two
+        of first order far apart.
     """
 
     starts: int = 24
@@ -96,6 +97,7 @@ class SearchOptions:
     highest: float = 0.4
     difference: float = 1e-5
     least_damping: float = 0.1
+    most_damping: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,9 @@ class Search:
         for i, setting in enumerate(cascade.settings):
             if "denominator" in setting.name and not setting.unit:
                 ranges[0, i] = max(ranges[0, i], options.least_damping)
-        hertz = [setting.unit == "Hz" for setting in cascade.settings]
+            if "damping" in setting.name:
+                ranges[1, i] = min(ranges[1, i], options.most_damping)
+        self.hertz = hertz = np.array([setting.unit == "Hz" for setting in cascade.settings])
         ranges[1, hertz] = np.minimum(ranges[1, hertz], options.highest / T)
         self.low, self.high = np.log(ranges)
         self.mass = self._mass(plants[0])
@@ -197,6 +201,16 @@ class Search:
             for value, slope in self._coefficients(kappa):
                 values.append(value)
                 slopes.append(slope)
+        if np.isfinite(self.cascade.filter_gain):
+            rise, steep = self.cascade.rises(np.exp(kappa), self.z)
+            values.append((rise - np.log(self.cascade.filter_gain)).ravel())
+            by_kappa = steep.reshape(len(kappa), -1).T
+            slopes.append(np.column_stack([by_kappa, np.zeros(len(by_kappa))]))
+        if self.hertz.any():  # filters below ω_b would take the place of the PI's own gains
+            values.append(log_band - np.log(HZ) - kappa[self.hertz])
+            own = np.zeros((self.hertz.sum(), len(kappa) + 1))
+            own[np.arange(len(own)), np.flatnonzero(self.hertz)], own[:, -1] = -1.0, 1.0
+            slopes.append(own)
         c = np.concatenate(values) + self.options.room
         good = np.isfinite(c)
         return c[good], np.concatenate(slopes)[good]
@@ -363,7 +377,9 @@ class Search:
     def judged(self, values: Array) -> tuple[float, float]:
         """ω_b by the shape, and the largest ln of a peak over its bound, on the grid."""
         K, b = self.cascade.responses(values, self.z)[0], self.bounds
-        bandwidth, worst = np.inf, -np.inf
+        bandwidth = np.inf
+        rise = self.cascade.rises(values, self.z)[0].max()
+        worst = float(rise - np.log(self.cascade.filter_gain))
         for G in self.G:
             for place, S, limit in self._figures(G * K):
                 worst = max(worst, float(np.log(S.max() / limit)))

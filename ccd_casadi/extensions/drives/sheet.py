@@ -26,6 +26,7 @@ def entry(design: DriveDesign) -> dict[str, Any]:
         "rate_hz": 1.0 / design.cascade.period,
         "bandwidth_hz": design.bandwidth / HZ,
         "free_bandwidth_hz": design.free.bandwidth / HZ,
+        "filter_gain": design.rise,
         "judge": {"passed": judged.passed, "words": judged.words, "plants": len(judged.plants),
                   "shares": bounds},
         "proof": {"proven": design.proof.proven, "words": design.proof.words,
@@ -56,6 +57,8 @@ def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) ->
     found.append(f"bandwidth     {rounded:.4g} Hz; {free:.4g} Hz before rounding, on fewer plants")
     found.append(f"judged        {design.certificate.words}")
     found.append(f"proof         {design.proof.words}")
+    limit = design.cascade.filter_gain
+    found.append(f"filters       raise their gain to {design.rise:.4g} of rest; limit {limit:.4g}")
     found += [f"chosen        {words}" for words in drive.chosen]
     found += [f"not known     {words}" for words in drive.unknown]
     return "\n".join(found)
