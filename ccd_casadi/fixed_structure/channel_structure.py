@@ -185,6 +185,13 @@ def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
                    dC=U.T @ plant.dC, channels=())  # fmt: skip
 
 
+def sensor_levels(plant: ScaledPlant, decoupling: Decoupling) -> Array:
+    """ln of the median |G_i| of each channel of a plant, over two decades below ω₀."""
+    G = in_channels(plant, decoupling).system.response(np.geomspace(0.01, 1.0, 49))
+    own = np.abs(G).max(axis=2)
+    return np.asarray(np.log(np.maximum(np.median(own, axis=0), 1e-300)))
+
+
 def channel_plant(
     plant: ScaledPlant, decoupling: Decoupling, number: int, *, absent: float = 1e-8
 ) -> ScaledPlant:
@@ -349,6 +356,11 @@ class ChannelStructure:
     def kinds(self) -> tuple[ParameterKind, ...]:
         """The kind of each parameter."""
         return tuple(kind for i in self.free for kind in self.structures[i].kinds)
+
+    @cached_property
+    def gains(self) -> np.ndarray:
+        """Which of the parameters are gains, (n,)."""
+        return np.array([kind is ParameterKind.GAIN for kind in self.kinds])
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
