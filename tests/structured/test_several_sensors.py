@@ -12,6 +12,7 @@ import ccd_casadi as ccd
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
+from ccd_casadi.cases.diagnosis import suspicions
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.break_points import SensorFamily
@@ -352,3 +353,39 @@ def test_a_design_in_millimetres_is_that_in_metres() -> None:
     judged = certify([plant], swapped, bounds(), RATE, integrator=True)
     assert judged.passed, judged.words
     assert judged.bandwidth == pytest.approx(other.bandwidth, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("directions", "reversed_rows", "named"),
+    [
+        (((1, 0), (0, 1)), (), []),
+        (((1, 0), (0, 1)), (0,), ["motor"]),
+        (((1, 0), (0, 1)), (0, 1), ["motor", "table"]),
+        (((1, 0), (0, -1)), (1,), []),  # as the channel has it
+        (((1, 1), (1, -1)), (), []),  # a difference sees no free body
+        (None, (1,), ["output 2"]),
+    ],
+)  # fmt: skip
+def test_a_reversed_sensor_is_named(
+    tmp_path: Path, directions: tuple[tuple[int, int], ...] | None,
+    reversed_rows: tuple[int, ...], named: list[str],
+) -> None:  # fmt: skip
+    signs = [-1.0 if i in reversed_rows else 1.0 for i in range(2)]
+    rows = '"both": ca.DM([[1.0, 0.0], [0.0, 1.0]])'
+    plant, text = ((EXAMPLE / name).read_text() for name in ("plant.py", "case.toml"))
+    assert rows in plant
+    (tmp_path / "plant.py").write_text(
+        plant.replace(rows, f'"both": ca.DM([[{signs[0]}, 0.0], [0.0, {signs[1]}]])')
+    )
+    if directions is None:
+        head, _, rest = text.replace('"table"', '"2"').partition("[controller.channel.motor]")
+        text = head + rest[rest.index("[inner]") :]
+    else:
+        for old, new in zip(("[1, 0]", "[0, 1]"), directions, strict=True):
+            assert f"outputs = {old}" in text
+            text = text.replace(f"outputs = {old}", f"outputs = {list(new)}", 1)
+    (tmp_path / "case.toml").write_text(text)
+    told = [w for w in suspicions(problem_of(load_case(tmp_path / "case.toml"))) if "sign" in w]
+    assert len(told) == len(named)
+    for words, name in zip(told, named, strict=True):
+        assert f"{name} to negative values" in words
