@@ -21,7 +21,7 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.text import HZ, is_force, spoken
+from ccd_casadi.support.text import HZ, is_force, of_newtons, spoken
 
 
 @dataclass(frozen=True)
@@ -176,9 +176,7 @@ def loop_findings(
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
 
 
-def _sign_words(
-    problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6
-) -> list[str]:
+def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
     """Of each channel whose sensor a positive force moves to negative values, but for `nothing` of
     what its modes could; of the directions that a design finds itself signs are known."""
     p, m = len(modal.C), modal.B.shape[1]
@@ -354,7 +352,7 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
         against = f"M_K suits {suits:.3g} Hz"
         if is_force(problem.spoken[1]):  # of a voltage 1/(b²) is not a mass
             moved = spoken(f"{facts.inertia:.3g} kg")
-            against += f" for the {moved} that an actuator moves"
+            against += f" for the {moved} that an actuator moves{of_newtons(problem.spoken[1])}"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:
@@ -362,7 +360,8 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     words = f"the first resonance is at {first:.3g} Hz, and {against}"
     if not is_force(problem.spoken[1]):
         return [f"{words}: is M_K in another unit?"]
-    return [f"{words}: is the stiffness in another unit? {SI}"]
+    undeclared = "; what is no force is declared in [units]" if problem.spoken[1] == "N" else ""
+    return [f"{words}: is the stiffness in another unit? {SI}{undeclared}"]
 
 
 def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> list[str]:
