@@ -153,8 +153,8 @@ def composite_problem(
     box, parts = box_of(structure, poles, first.omega_0, sampling, frequencies), []
     if bounds.error is not None:
         levels = sensor_levels(first, structure.decoupling)
-        for place, level in zip(structure.slices, levels, strict=True):
-            box[:, place] -= level * structure.gains[place]
+        for at, level in zip(structure.slices, levels, strict=True):
+            box[:, at] -= level * structure.gains[at]
     if apart.any():
         members = np.flatnonzero(apart)
         singles: list[list[ScaledPlant]] = []
