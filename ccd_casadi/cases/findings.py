@@ -197,6 +197,11 @@ def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float =
         # of a free or driven-away body as it accelerates, else at rest
         moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
         largest = np.linalg.norm(out @ modal.C) * np.linalg.norm(modal.B @ into)
+        if not largest > 0.0:
+            words.append(
+                f"{sensor} reads nothing that the actuator moves: no design is made with it; "
+                "correct its row of output, or leave it out"
+            )
         if not rigid.any() and not away:
             largest /= float(np.abs(np.diag(modal.K)).max())
         if moved.sum() < -nothing * largest:

@@ -186,10 +186,17 @@ def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
 
 
 def sensor_levels(plant: ScaledPlant, decoupling: Decoupling) -> Array:
-    """ln of the median |G_i| of each channel of a plant, over two decades below ω₀."""
+    """ln of the median |G_i| of each channel of a plant, over two decades below ω₀.
+
+    Raises PlantError for a channel that reads nothing.
+    """
     G = in_channels(plant, decoupling).system.response(np.geomspace(0.01, 1.0, 49))
-    own = np.abs(G).max(axis=2)
-    return np.asarray(np.log(np.maximum(np.median(own, axis=0), 1e-300)))
+    own = np.median(np.abs(G).max(axis=2), axis=0)
+    for name, level in zip(decoupling.names, own, strict=True):
+        if not level > 0.0:
+            words = "reads nothing that the actuator moves; correct its row of output, or leave"
+            raise PlantError(f"the sensor of channel {name} {words} it out")
+    return np.asarray(np.log(own))
 
 
 def channel_plant(

@@ -35,6 +35,7 @@ from ccd_casadi.kernels.loop_grid import second
 from ccd_casadi.kernels.sections import LoopCurve
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.second_engine import second_opinion
 
@@ -389,3 +390,10 @@ def test_a_reversed_sensor_is_named(
     assert len(told) == len(named)
     for words, name in zip(told, named, strict=True):
         assert f"{name} to negative values" in words
+
+
+def test_a_sensor_that_reads_nothing_is_refused_by_name() -> None:
+    plant = two_masses()
+    system = control.ss(plant.A, plant.B, np.diag([0.0, 1.0]) @ plant.C, plant.D)
+    with pytest.raises(PlantError, match="sensor of channel motor reads nothing"):
+        ccd.synthesise_sections(system, SECTIONS, bounds(), sampling=RATE, M_K=1e4, starts=2)
