@@ -14,13 +14,14 @@ import numpy as np
 
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.text import HZ, is_force, spoken
+from ccd_casadi.support.text import HZ, is_force, of_newtons, spoken
 
 
 @dataclass(frozen=True)
@@ -164,26 +165,52 @@ def loop_findings(
     *,
     options: FindingOptions = FindingOptions(),
 ) -> list[Finding]:
-    """Warnings about the sign of a plant with one input and output, and about the delay and the
-    rate of its loop."""
-    words = []
-    if len(modal.C) == 1 == modal.B.shape[1]:
-        gains = modal.C[0] * modal.B[:, 0]
-        rigid, away = modal.rigid, bool(modal.driven_away.any())
-        # of a free or driven-away body as it accelerates, else at rest
-        moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
-        if moved.sum() < 0.0:
-            words.append(
-                "a positive force moves the sensor to negative values, so that a controller of "
-                "positive gain is unstable: is the sign of output or input as it is wired? "
-                "If not, correct the row or the column"
-            )
+    """Warnings about signs of sensors and actuators, and about the delay and the rate of the
+    loop."""
+    words = _sign_words(problem, modal)
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if (run := problem.sampling) is not None:
         meant = facts.effort_hz if states_effort(problem) else np.nan
         words += _lag_words(run, meant, options)
         words += _unstable_words(run, growth, problem.inner.S_max)
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
+
+
+def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
+    """Of each channel whose sensor a positive force moves to negative values, but for `nothing` of
+    what its modes could; of the directions that a design finds itself signs are known."""
+    p, m = len(modal.C), modal.B.shape[1]
+    controller = problem.controller
+    given = controller.channels if isinstance(controller, StructuredProblem) else ()
+    if p == 1 == m:
+        pairs = [("the sensor", np.ones(1), np.ones(1))]
+    elif given and given[0].outputs is not None:
+        pairs = [(f"the sensor of channel {one.name}", np.array(one.outputs),
+                  np.ones(1) if m == 1 else np.array(one.inputs)) for one in given]  # fmt: skip
+    else:  # each sensor alone where they share the actuator
+        pairs = [(f"the sensor of output {i + 1}", row, np.ones(1))
+                 for i, row in enumerate(np.eye(p)) if m == 1]  # fmt: skip
+    rigid, away = modal.rigid, bool(modal.driven_away.any())
+    words = []
+    for sensor, out, into in pairs:
+        gains = (out @ modal.C) * (modal.B @ into)
+        # of a free or driven-away body as it accelerates, else at rest
+        moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
+        largest = np.linalg.norm(out @ modal.C) * np.linalg.norm(modal.B @ into)
+        if not largest > 0.0:
+            words.append(
+                f"{sensor} reads nothing that the actuator moves: no design is made with it; "
+                "correct its row of output, or leave it out"
+            )
+        if not rigid.any() and not away:
+            largest /= float(np.abs(np.diag(modal.K)).max())
+        if moved.sum() < -nothing * largest:
+            words.append(
+                f"a positive force moves {sensor} to negative values, so that a controller of "
+                "positive gain is unstable: is the sign of output or input as it is wired? "
+                "If not, correct the row or the column"
+            )
+    return words
 
 
 def states_effort(problem: CoDesignProblem) -> bool:
@@ -330,7 +357,7 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
         against = f"M_K suits {suits:.3g} Hz"
         if is_force(problem.spoken[1]):  # of a voltage 1/(b²) is not a mass
             moved = spoken(f"{facts.inertia:.3g} kg")
-            against += f" for the {moved} that an actuator moves"
+            against += f" for the {moved} that an actuator moves{of_newtons(problem.spoken[1])}"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:
@@ -338,7 +365,8 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     words = f"the first resonance is at {first:.3g} Hz, and {against}"
     if not is_force(problem.spoken[1]):
         return [f"{words}: is M_K in another unit?"]
-    return [f"{words}: is the stiffness in another unit? {SI}"]
+    undeclared = "; what is no force is declared in [units]" if problem.spoken[1] == "N" else ""
+    return [f"{words}: is the stiffness in another unit? {SI}{undeclared}"]
 
 
 def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> list[str]:

@@ -13,7 +13,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.plants.plant_facts import PlantFacts
-from ccd_casadi.support.text import is_force, number, spoken
+from ccd_casadi.support.text import is_force, number, of_newtons, spoken
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,8 @@ def size_words(
     """
     parts = []
     if math.isfinite(facts.inertia) and is_force(case.units.input):
-        parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
+        moved = spoken(f"an actuator moves {facts.inertia:.3g} kg")
+        parts.append(moved + of_newtons(case.units.input))
     flexible = [mode.frequency_hz for mode in facts.modes if mode.resonant]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):

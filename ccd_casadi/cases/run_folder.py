@@ -115,8 +115,10 @@ class FinishedRun(NotebookHtml):
         return free_modal(self.problem, self.system, *off)
 
     def loop_on(self, plant: StateSpace) -> Loop:
-        """The loop on a plant in SI, as it runs."""
-        return loop_on(self.problem, plant, self.controller)
+        """The loop on a plant in SI, as it runs: as a controller that is checked does, else as the
+        case has it."""
+        found = loop_on(self.problem, plant, self.controller)
+        return found if self.sampling is None else replace(found, sampling=self.sampling)
 
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""

@@ -20,8 +20,9 @@ from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     channel_plant,
     in_units_of,
+    sensor_levels,
 )
-from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike
+from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, in_search_units
 from ccd_casadi.fixed_structure.design import (
     DesignOptions,
     DesignSearch,
@@ -35,7 +36,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, run_race, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
-from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
 from ccd_casadi.support.arrays import Array
@@ -154,7 +155,7 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
 def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesign:
     """Each channel on its own, and then, where they are coupled, the whole loop."""
     structure, only_initial = problem.structure, search.only_initial
-    alike = [in_units_of(plant, search.plants[0]) for plant in search.plants]
+    alike = in_search_units(search.plants, problem.bounds)
     if problem.separable:
         made = _of_channels(search, problem, alike)
         short = [(name, one) for name, one in zip(structure.decoupling.names, made, strict=True)
@@ -195,12 +196,14 @@ def _of_sensors(
 ) -> list[Array]:
     """Controllers κ in SI of one sensor alone, the others' gains as small as they may be."""
     bounds, structure = replace(problem.bounds, channels=(), error=None), problem.structure
-    gains = np.array([kind is ParameterKind.GAIN for kind in structure.kinds])
-    least = np.where(gains, problem.box[0], problem.box.mean(axis=0))
+    least = np.where(structure.gains, problem.box[0], problem.box.mean(axis=0))
+    levels = sensor_levels(alike[0], structure.decoupling)
     idle = structure.in_units(least, problem.plants.omega_0, problem.plants.force)
     found = list[Array]()
     for i, own in enumerate(structure.structures):
-        plants = [channel_plant(plant, structure.decoupling, i) for plant in alike]
+        unit = replace(alike[0], force=alike[0].force * np.exp(-levels[i]))
+        plants = [in_units_of(channel_plant(plant, structure.decoupling, i), unit)
+                  for plant in alike]  # fmt: skip
         try:
             alone = problem_for(plants, own, bounds, search.sampling, span_of(problem),
                                 margin=problem.margin)  # fmt: skip

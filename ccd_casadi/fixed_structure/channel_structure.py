@@ -185,6 +185,20 @@ def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
                    dC=U.T @ plant.dC, channels=())  # fmt: skip
 
 
+def sensor_levels(plant: ScaledPlant, decoupling: Decoupling) -> Array:
+    """ln of the median |G_i| of each channel of a plant, over two decades below ω₀.
+
+    Raises PlantError for a channel that reads nothing.
+    """
+    G = in_channels(plant, decoupling).system.response(np.geomspace(0.01, 1.0, 49))
+    own = np.median(np.abs(G).max(axis=2), axis=0)
+    for name, level in zip(decoupling.names, own, strict=True):
+        if not level > 0.0:
+            words = "reads nothing that the actuator moves; correct its row of output, or leave"
+            raise PlantError(f"the sensor of channel {name} {words} it out")
+    return np.asarray(np.log(own))
+
+
 def channel_plant(
     plant: ScaledPlant, decoupling: Decoupling, number: int, *, absent: float = 1e-8
 ) -> ScaledPlant:
@@ -349,6 +363,11 @@ class ChannelStructure:
     def kinds(self) -> tuple[ParameterKind, ...]:
         """The kind of each parameter."""
         return tuple(kind for i in self.free for kind in self.structures[i].kinds)
+
+    @cached_property
+    def gains(self) -> np.ndarray:
+        """Which of the parameters are gains, (n,)."""
+        return np.array([kind is ParameterKind.GAIN for kind in self.kinds])
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:

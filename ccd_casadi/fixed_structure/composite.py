@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.channel_structure import (
     channel_plant,
     in_units_of,
     is_decoupled,
+    sensor_levels,
 )
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import (
@@ -144,12 +145,16 @@ def composite_problem(
     Coupled plants are in parts of `most_coupled` at most, which are computed side by side.
     Raises PlantError as `plant_set` does.
     """
-    first = plants[0]
-    alike = [in_units_of(plant, first) for plant in plants]
+    alike = in_search_units(plants, bounds)
+    first = alike[0]
     apart = np.array([is_decoupled(plant, structure.decoupling) for plant in alike])
     together = np.flatnonzero(~apart)
     poles = np.concatenate([np.linalg.eigvals(plant.A) for plant in alike])
     box, parts = box_of(structure, poles, first.omega_0, sampling, frequencies), []
+    if bounds.error is not None:
+        levels = sensor_levels(first, structure.decoupling)
+        for at, level in zip(structure.slices, levels, strict=True):
+            box[:, at] -= level * structure.gains[at]
     if apart.any():
         members = np.flatnonzero(apart)
         singles: list[list[ScaledPlant]] = []
@@ -170,6 +175,20 @@ def composite_problem(
         parts.append(Part(whole, place, members))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
+
+
+def in_search_units(plants: Sequence[ScaledPlant], bounds: Bounds) -> list[ScaledPlant]:
+    """The plants in one unit of time and force.
+
+    Those of the first; of several sensors on one actuator, each with a unit of its own, that ω₀
+    says nothing (it is of all readings together): there it is a decade above the least bandwidth
+    that the bounds ask for.
+    """
+    first = plants[0]
+    if bounds.error is not None:
+        first = replace(first, omega_0=10.0 * bounds.omega_low / bounds.S_low)
+        first = in_units_of(plants[0], first)
+    return [in_units_of(plant, first) for plant in plants]
 
 
 def on_plants(
@@ -194,6 +213,8 @@ def on_plants(
     if not isinstance(problem, CompositeProblem):
         return replace(problem, plants=plant_set(plants, sampling, alike=True))
     decoupling, parts = problem.structure.decoupling, []
+    units = replace(plants[0], omega_0=problem.plants.omega_0, force=problem.plants.force)
+    plants = [in_units_of(plant, units) for plant in plants]
     for part in problem.parts:
         members, channel = [plants[i] for i in part.members], part.channel
         if channel is None:

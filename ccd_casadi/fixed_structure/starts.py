@@ -12,12 +12,17 @@ plant is on its stiffness line at the crossover (a piezo) its lead is turned aro
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, channel_plant
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    channel_plant,
+    sensor_levels,
+)
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.plant_set import PlantSet, all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.structure import ParameterKind
@@ -165,12 +170,16 @@ def _seen_by(
     structure: ChannelStructure, plant: ScaledPlant, number: int, sampling: Sampling | None
 ) -> PlantSet:
     """The plant of a channel, or of the first that can hold all motions where this one cannot, as
-    the difference of two sensors cannot hold a free body."""
+    the difference of two sensors cannot hold a free body; in the unit of the channel's sensor."""
+    levels = sensor_levels(plant, structure.decoupling)
     order = [number, *(i for i in range(len(structure.structures)) if i != number)]
-    for i in order[:-1]:
-        with suppress(PlantError):
-            return plant_set([channel_plant(plant, structure.decoupling, i)], sampling)
-    return plant_set([channel_plant(plant, structure.decoupling, order[-1])], sampling)
+    for i in order:
+        own = channel_plant(plant, structure.decoupling, i)
+        if i != number:
+            own = replace(own, C=own.C * np.exp(levels[number] - levels[i]))
+        with suppress(PlantError) if i != order[-1] else nullcontext():
+            return plant_set([own], sampling)
+    raise AssertionError
 
 
 def actuator_starts(

@@ -78,6 +78,28 @@ def is_force(unit: str) -> bool:
     return unit in ("N", "N m")
 
 
+def of_newtons(unit: str) -> str:
+    """Say on what a mass that is found from a response depends: inputs count as newtons where a
+    case does not say what they are.
+
+    Parameters
+    ----------
+    unit : str
+        Of the input.
+
+    Returns
+    -------
+    str
+        To stand behind the mass; empty of a unit that a case has to declare.
+
+    Examples
+    --------
+    >>> of_newtons("N"), of_newtons("N m")
+    (' if its input is in N', '')
+    """
+    return " if its input is in N" if unit == "N" else ""
+
+
 def display_unit(unit: str, largest: float) -> tuple[str, float]:
     """Choose the unit to show values in.
 

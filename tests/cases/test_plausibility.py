@@ -117,4 +117,6 @@ def test_no_mass_is_moved_by_what_is_not_a_force(unit: str, M_K: float) -> None:
     force = unit.startswith("N")
     assert ("an actuator moves" in found["size"]) == force
     assert force or not [text for text in words if "kg" in text or "force over" in text]
+    undeclared = [text for text in words if "that an actuator moves" in text or text == words[0]]
+    assert all(("if its input is in N" in text) == (unit == "N") for text in undeclared)
     assert found["size"]  # the resonance and M_K stay

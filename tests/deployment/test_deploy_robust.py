@@ -10,6 +10,7 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
+from ccd_casadi.deployment.given_controller import with_controller
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import DeploymentOptions, deploy
 from ccd_casadi.deployment.timing import Timing
@@ -50,11 +51,12 @@ def deployed(robust_run: Path) -> tuple[FinishedRun, Deployment]:
 
 
 def peaks(run: FinishedRun, found, shifts) -> list[float]:  # type: ignore[no-untyped-def]
-    """‖S‖∞ of the sampled loop on plants built here; inf where it is unstable."""
+    """‖S‖∞ of the sampled loop on plants built here, bodies free as no design suspends them; inf
+    where it is unstable."""
     system = mechanics(plant_of(run.problem), run.theta)
     out = []
     for shift in shifts:
-        modal = modal_plant(system, run.problem.suspension, Perturbation(float(shift)))
+        modal = modal_plant(system, run.problem.suspension.free, Perturbation(float(shift)))
         plant = scale_plant(modal, run.weights.M_K).plant_si()
         held = sampled(plant, 1.0 / found.rate_hz, found.delay)
         figures = sampled_figures(closed_loop(held, found.realisation.system).S)
@@ -143,6 +145,17 @@ def test_a_rate_below_twice_the_peak_is_one_line(
     code = main([str(robust_run), *words, "--quiet", "--out", str(tmp_path / "d")])
     assert code in (2, 4)
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_deployed_controller_of_a_continuous_design_is_judged_as_it_runs(
+    robust_run: Path, deployed: tuple[FinishedRun, Deployment], tmp_path: Path
+) -> None:
+    run, found = deployed
+    assert run.problem.sampling is None
+    assert main([str(robust_run), *QUICK, "--out", str(tmp_path)]) == 0
+    own = with_controller(run, tmp_path / "controller.json")
+    assert own.loop_on(run.plant.plant_si()).period == pytest.approx(1.0 / found.rate_hz)
+    assert own.figures.sensitivity_peak == pytest.approx(peaks(run, found, [0.0])[0], rel=1e-6)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import ccd_casadi as ccd
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
+from ccd_casadi.cases.diagnosis import suspicions
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.break_points import SensorFamily
@@ -22,8 +23,11 @@ from ccd_casadi.fixed_structure.channel_structure import (
     given_decoupling,
     sensors_on_one_actuator,
 )
+from ccd_casadi.fixed_structure.composite import in_search_units
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import RowPlaces, evaluate_rows
+from ccd_casadi.fixed_structure.figures import RowPlaces, assess, evaluate_rows
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem
+from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
@@ -31,6 +35,7 @@ from ccd_casadi.kernels.loop_grid import second
 from ccd_casadi.kernels.sections import LoopCurve
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.second_engine import second_opinion
 
@@ -302,3 +307,93 @@ def test_a_difference_of_sensors_that_sees_no_free_body_is_a_channel() -> None:
         M_K=0.11 * (30.0 * HZ) ** 2, starts=3,
     )  # fmt: skip
     assert made.certified, made.words
+
+
+def highest(problem: LoopProblem, kappa: np.ndarray) -> dict[tuple[int, int], float]:
+    """By curve and number the largest value over its bound."""
+    rows, found = assess(problem, kappa, -1.0).peaks, dict[tuple[int, int], float]()
+    assert rows is not None
+    for curve, number, value in zip(rows.curve, rows.plant, rows.value, strict=True):
+        key = int(curve), int(number)
+        found[key] = max(found.get(key, -np.inf), float(value))
+    return found
+
+
+@pytest.mark.parametrize("units", [(1e3, 1.0), (1.0, 1e3), (1e-4, 30.0)])
+def test_a_sensor_may_have_any_unit(units: tuple[float, float]) -> None:
+    """What the search starts from, its box and its figures are those in metres, K's columns over
+    the units."""
+    plant, rng = two_masses(), np.random.default_rng
+    names = [f"{name}: gain" for name in SENSORS.names]
+    shift = np.zeros(len(SECTIONS.names))
+    shift[[SECTIONS.names.index(name) for name in names]] = -np.log(units)
+    found = []
+    for C in (plant.C, np.diag(units) @ plant.C):
+        scaled = _scaled(control.ss(plant.A, plant.B, C, plant.D), bounds(), 1e4)
+        problem = problem_for(scaled, SECTIONS, bounds(), RATE)
+        alike = in_search_units(scaled, bounds())
+        starts = actuator_starts(problem, SECTIONS, alike, RATE, 3, rng(0))
+        found.append((problem, np.array(starts)))
+    (metres, starts), (other, moved) = found
+    np.testing.assert_allclose(other.box, metres.box + shift, atol=1e-9)
+    np.testing.assert_allclose(moved, starts + shift, atol=1e-9)
+    for kappa in starts:
+        assert highest(other, kappa + shift) == pytest.approx(highest(metres, kappa), abs=1e-7)
+
+
+def test_a_design_in_millimetres_is_that_in_metres() -> None:
+    plant, made = two_masses(), design()
+    units = np.array([1e3, 1.0])
+    system = control.ss(plant.A, plant.B, units[:, None] * plant.C, plant.D)
+    other = ccd.synthesise_sections(system, SECTIONS, bounds(), sampling=RATE, starts=6,
+                                    M_K=0.11 * (30.0 * HZ) ** 2)  # fmt: skip
+    assert other.certified, other.words
+    assert other.bandwidth == pytest.approx(made.bandwidth, rel=1e-4)
+    # and each is one of the other's plant
+    swapped = replace(other.controller, B=other.controller.B * units, D=other.controller.D * units)
+    judged = certify([plant], swapped, bounds(), RATE, integrator=True)
+    assert judged.passed, judged.words
+    assert judged.bandwidth == pytest.approx(other.bandwidth, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("directions", "reversed_rows", "named"),
+    [
+        (((1, 0), (0, 1)), (), []),
+        (((1, 0), (0, 1)), (0,), ["motor"]),
+        (((1, 0), (0, 1)), (0, 1), ["motor", "table"]),
+        (((1, 0), (0, -1)), (1,), []),  # as the channel has it
+        (((1, 1), (1, -1)), (), []),  # a difference sees no free body
+        (None, (1,), ["output 2"]),
+    ],
+)  # fmt: skip
+def test_a_reversed_sensor_is_named(
+    tmp_path: Path, directions: tuple[tuple[int, int], ...] | None,
+    reversed_rows: tuple[int, ...], named: list[str],
+) -> None:  # fmt: skip
+    signs = [-1.0 if i in reversed_rows else 1.0 for i in range(2)]
+    rows = '"both": ca.DM([[1.0, 0.0], [0.0, 1.0]])'
+    plant, text = ((EXAMPLE / name).read_text() for name in ("plant.py", "case.toml"))
+    assert rows in plant
+    (tmp_path / "plant.py").write_text(
+        plant.replace(rows, f'"both": ca.DM([[{signs[0]}, 0.0], [0.0, {signs[1]}]])')
+    )
+    if directions is None:
+        head, _, rest = text.replace('"table"', '"2"').partition("[controller.channel.motor]")
+        text = head + rest[rest.index("[inner]") :]
+    else:
+        for old, new in zip(("[1, 0]", "[0, 1]"), directions, strict=True):
+            assert f"outputs = {old}" in text
+            text = text.replace(f"outputs = {old}", f"outputs = {list(new)}", 1)
+    (tmp_path / "case.toml").write_text(text)
+    told = [w for w in suspicions(problem_of(load_case(tmp_path / "case.toml"))) if "sign" in w]
+    assert len(told) == len(named)
+    for words, name in zip(told, named, strict=True):
+        assert f"{name} to negative values" in words
+
+
+def test_a_sensor_that_reads_nothing_is_refused_by_name() -> None:
+    plant = two_masses()
+    system = control.ss(plant.A, plant.B, np.diag([0.0, 1.0]) @ plant.C, plant.D)
+    with pytest.raises(PlantError, match="sensor of channel motor reads nothing"):
+        ccd.synthesise_sections(system, SECTIONS, bounds(), sampling=RATE, M_K=1e4, starts=2)
