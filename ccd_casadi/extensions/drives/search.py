@@ -201,19 +201,26 @@ class Search:
             for value, slope in self._coefficients(kappa):
                 values.append(value)
                 slopes.append(slope)
-        if np.isfinite(self.cascade.filter_gain):
-            rise, steep = self.cascade.rises(np.exp(kappa), self.z)
-            values.append((rise - np.log(self.cascade.filter_gain)).ravel())
-            by_kappa = steep.reshape(len(kappa), -1).T
-            slopes.append(np.column_stack([by_kappa, np.zeros(len(by_kappa))]))
-        if self.hertz.any():  # filters below ω_b would take the place of the PI's own gains
-            values.append(log_band - np.log(HZ) - kappa[self.hertz])
-            own = np.zeros((self.hertz.sum(), len(kappa) + 1))
-            own[np.arange(len(own)), np.flatnonzero(self.hertz)], own[:, -1] = -1.0, 1.0
-            slopes.append(own)
+        for value, slope in self._filter_rows(kappa, log_band):
+            values.append(value)
+            slopes.append(slope)
         c = np.concatenate(values) + self.options.room
         good = np.isfinite(c)
         return c[good], np.concatenate(slopes)[good]
+
+    def _filter_rows(self, kappa: Array, log_band: float) -> list[tuple[Array, Array]]:
+        """What filters may not do: raise their gain beyond `filter_gain`, or lie below ω_b, where
+        they would take the place of the PI."""
+        found, n = [], len(kappa)
+        if np.isfinite(self.cascade.filter_gain):
+            rise, steep = self.cascade.rises(np.exp(kappa), self.z)
+            by_kappa = steep.reshape(n, -1).T
+            value = (rise - np.log(self.cascade.filter_gain)).ravel()
+            found.append((value, np.column_stack([by_kappa, np.zeros(len(by_kappa))])))
+        places = np.flatnonzero(self.hertz)
+        slope = np.zeros((len(places), n + 1))
+        slope[np.arange(len(places)), places], slope[:, -1] = -1.0, 1.0
+        return [*found, (log_band - np.log(HZ) - kappa[places], slope)]
 
     def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
         """ln of the largest coefficient of each filter over what fixed point holds, by central
