@@ -14,6 +14,7 @@ from ccd_casadi.extensions.rib_stage.mesh import COARSE
 from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, faded
 from ccd_casadi.extensions.rib_stage.plant import plant_of_stage
 from ccd_casadi.plants.plant import Mechanics, nearby_model
+from ccd_casadi.plants.registry import two_mass_plant
 from ccd_casadi.support.arrays import Array
 
 HERE = np.array([1.2e-3, 3.3e-3, 5e-3, 5e-3, 14e-3, 74e-3])
@@ -164,3 +165,13 @@ def test_where_the_order_of_modes_is_not_kept_it_does_not_apply() -> None:
     assert reduced.applies(LOADED)
     assert not reduced.applies(replace(BARE, geometry=middle))
     assert not reduced.applies(replace(BARE, truncation="frequency"))
+
+
+def test_a_model_nearby_is_a_speed_up_and_decides_no_strategy() -> None:
+    """What a search saves is said by the plant's own cost."""
+    plant = plant_of_stage(BARE)
+    assert plant.expensive
+    assert plant.nearby is not None
+    assert replace(plant, nearby=None).expensive
+    cheap = replace(two_mass_plant(("m1", "m2")), nearby=plant.nearby)
+    assert not cheap.expensive
