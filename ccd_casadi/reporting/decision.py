@@ -1,6 +1,6 @@
 """Whether to build a design: a decision as a value, derived from result.json and never stored.
 
-A decision has a state (`Build`), findings with enumerated reasons, and what to do next. Its words
+A decision has a state (`Build`), concerns with enumerated reasons, and what to do next. Its words
 are rendered from these and never read back. It rests on the five lines of the verdict and on
 `concerns`.
 """
@@ -44,7 +44,7 @@ class Build(StrEnum):
     YES, AFTER_DEPLOY
         Every line passed; hold and delay are not judged yet.
     IF_ACCEPTED
-        The findings are for the reader to weigh.
+        The concerns are for the reader to weigh.
     NOT_YET, NO
         What it survives is not known, or a move does not settle; a line failed.
     LOOK, NOT_VERIFIED, NOTHING
@@ -93,7 +93,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class Concern:
     """A reason, in words for this design."""
 
     reason: Reason
@@ -107,11 +107,11 @@ class Decision:
     Attributes
     ----------
     build : Build
-    findings : tuple of Finding
+    concerns : tuple of Concern
         The first is the most important.
     steps : tuple of str
         What to do next.
-    beside : tuple of Finding
+    beside : tuple of Concern
         What else speaks against a design that must not be built.
     unjudged : bool
         Hold and delay are not judged yet.
@@ -120,16 +120,16 @@ class Decision:
     """
 
     build: Build
-    findings: tuple[Finding, ...] = ()
+    concerns: tuple[Concern, ...] = ()
     steps: tuple[str, ...] = ()
-    beside: tuple[Finding, ...] = ()
+    beside: tuple[Concern, ...] = ()
     unjudged: bool = False
     condition: str = ""
 
     @property
     def words(self) -> str:
         """The decision in a sentence or two, for terminal and pages."""
-        parts = [SENTENCES[self.build].format("; ".join(one.words for one in self.findings))]
+        parts = [SENTENCES[self.build].format("; ".join(one.words for one in self.concerns))]
         parts += [f"Besides, {one.words}." for one in self.beside]
         parts += [f"Next: {'; '.join(self.steps)}."] if self.steps else []
         if self.unjudged and self.build is Build.IF_ACCEPTED:
@@ -212,52 +212,52 @@ def decide(result: Mapping[str, Any]) -> Decision:
         return _decide_loop(result)
     failed = [name for name, state in states.items() if state == State.FAILED]
     move = limited_move(result)
-    beside = (Finding(Reason.MOVE, move),) if move else ()
+    beside = (Concern(Reason.MOVE, move),) if move else ()
     if failed or result.get("status") != "verified":
-        why = Finding(Reason.NOT_VERIFIED, "it is not verified")
+        why = Concern(Reason.NOT_VERIFIED, "it is not verified")
         if failed:
-            why = Finding(Reason.LINE_FAILED, f"{' and '.join(failed)} failed")
+            why = Concern(Reason.LINE_FAILED, f"{' and '.join(failed)} failed")
         step = _next_of_failed(failed[0], result) if failed else "see why"
         return Decision(Build.NO, (why,), (step,), beside)
     if states.get("certified") == State.UNKNOWN:
-        why = Finding(Reason.LINE_UNKNOWN, "whether it is certified is not known")
+        why = Concern(Reason.LINE_UNKNOWN, "whether it is certified is not known")
         return Decision(Build.NOT_YET, (why,), (NEXT["certified"],), beside)
-    survival = _survival_findings(result, states.get("survives"))
+    survival = _survival_concerns(result, states.get("survives"))
     against = {Reason.SMALL_ERRORS: Build.NO, Reason.MODEL_ALONE: Build.NOT_YET,
                Reason.SURVIVAL_UNKNOWN: Build.NOT_YET}  # fmt: skip
-    for finding in survival:
-        if finding.reason in against:
+    for concern in survival:
+        if concern.reason in against:
             kept = result["verdict"]["survives"].get("set") == OwnSet.KEPT
             step = NEXT["wider" if kept else "survives"]
-            return Decision(against[finding.reason], (finding,), (step,), beside)
+            return Decision(against[concern.reason], (concern,), (step,), beside)
     if move:
         return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
     warned = [
-        Finding(Reason.LINE_WARNED, f"{name} warned")
+        Concern(Reason.LINE_WARNED, f"{name} warned")
         for name, state in states.items()
         if state == State.WARNED and name != "survives"
     ]
     searched = [one for one in survival if one.reason is Reason.SET_SEARCHED]
     weighed = [one for one in survival if one.reason is not Reason.SET_SEARCHED]
-    findings = [*weighed, *warned, *searched]
+    concerns = [*weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
         words = f"the search was ended by its budget of {budget['minutes']:g} min"
-        findings.append(Finding(Reason.BUDGET, words))
+        concerns.append(Concern(Reason.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"
-        findings.append(Finding(Reason.LINE_UNKNOWN, words))
-    findings += _loop_findings(result)
+        concerns.append(Concern(Reason.LINE_UNKNOWN, words))
+    concerns += _loop_concerns(result)
     unjudged = states.get("deployable") == State.UNKNOWN
     condition = resonance_condition(result)
-    if not findings:
+    if not concerns:
         build = Build.AFTER_DEPLOY if unjudged else Build.YES
         return Decision(build, unjudged=unjudged, condition=condition)
     remedies = {Reason.SET_UNPROVEN: "unproven", Reason.CURRENT: "current",
                 Reason.LOOP: "loop", Reason.BUDGET: "budget"}  # fmt: skip
-    present = {one.reason for one in findings}
+    present = {one.reason for one in concerns}
     steps = tuple(NEXT[name] for reason, name in remedies.items() if reason in present)
-    return Decision(Build.IF_ACCEPTED, tuple(findings), steps, (), unjudged, condition)
+    return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition)
 
 
 def advice(result: Mapping[str, Any]) -> str:
@@ -280,41 +280,41 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
     """Of a loop without a verdict: `tune` and baselines."""
     if result.get("status", "verified") != "verified":
         return Decision(Build.NOT_VERIFIED, steps=("see why",))
-    findings = _loop_findings(result)
-    if not findings:
+    concerns = _loop_concerns(result)
+    if not concerns:
         return Decision(Build.NOTHING)
     step = "a smaller S_max"
-    if [one.words for one in findings] == line_concern(result):
+    if [one.words for one in concerns] == line_concern(result):
         step = "more lines there, or more averages"
-    if all(one.reason is Reason.CURRENT for one in findings):
+    if all(one.reason is Reason.CURRENT for one in concerns):
         step = NEXT["current"]
-    return Decision(Build.LOOK, findings, (step,))
+    return Decision(Build.LOOK, concerns, (step,))
 
 
-def _loop_findings(result: Mapping[str, Any]) -> tuple[Finding, ...]:
+def _loop_concerns(result: Mapping[str, Any]) -> tuple[Concern, ...]:
     current = current_concern(result)
     return tuple(
-        Finding(Reason.CURRENT if words in current else Reason.LOOP, words)
+        Concern(Reason.CURRENT if words in current else Reason.LOOP, words)
         for words in loop_concerns(result)
     )
 
 
-def _survival_findings(result: Mapping[str, Any], state: str | None) -> list[Finding]:
+def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Concern]:
     """What the line `survives` adds; nothing where it passed."""
     own = result["verdict"].get("survives", {}).get("set")
     if state == State.WARNED:
         if own == OwnSet.UNPROVEN:
             words = "the bounds are not proven on the whole [robust] set"
-            return [Finding(Reason.SET_UNPROVEN, words)]
+            return [Concern(Reason.SET_UNPROVEN, words)]
         if own == OwnSet.KEPT and (doubt := _unstable_controller(result)):
-            return [Finding(Reason.UNSTABLE_CONTROLLER, doubt)]
+            return [Concern(Reason.UNSTABLE_CONTROLLER, doubt)]
         if own == OwnSet.NONE:
-            return [Finding(Reason.MODEL_ALONE, "it was judged on the model alone")]
-        return [Finding(Reason.SMALL_ERRORS, "it does not survive small errors of its model")]
+            return [Concern(Reason.MODEL_ALONE, "it was judged on the model alone")]
+        return [Concern(Reason.SMALL_ERRORS, "it does not survive small errors of its model")]
     if state == State.UNKNOWN:
         if own == OwnSet.SEARCHED:
-            return [Finding(Reason.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
-        return [Finding(Reason.SURVIVAL_UNKNOWN, "what it survives is not known")]
+            return [Concern(Reason.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
+        return [Concern(Reason.SURVIVAL_UNKNOWN, "what it survives is not known")]
     return []
 
 

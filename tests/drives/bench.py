@@ -3,7 +3,7 @@
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive import read_drive
+from ccd_casadi.extensions.drives.drive_data import read_drive
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import given_decoupling, sensors_on_one_actuator
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

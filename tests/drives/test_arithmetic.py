@@ -13,7 +13,7 @@ from oracles import drive_simulation as oracle
 
 from ccd_casadi.extensions.drives.arithmetic import Program, program_of
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive import read_drive
+from ccd_casadi.extensions.drives.drive_data import read_drive
 from ccd_casadi.extensions.drives.forms import Number
 
 RATE = 8000.0

@@ -9,12 +9,12 @@ from bench import RATE, SLOW, bounds, cascade, uncertain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.extensions.drives.design import DriveOptions, design_drive, require_known
-from ccd_casadi.extensions.drives.drive import known_drives, read_drive
+from ccd_casadi.extensions.drives.cascade_search import Search, SearchOptions
+from ccd_casadi.extensions.drives.drive_data import known_drives, read_drive
+from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive, require_known
 from ccd_casadi.extensions.drives.forms import FORMS, Filter, Number, Rule
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.sampled_model import SampledModel
-from ccd_casadi.extensions.drives.search import Search, SearchOptions
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.support.errors import UserError

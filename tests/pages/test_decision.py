@@ -68,7 +68,7 @@ def test_no_decision_builds_what_failed_or_is_not_known(
         result["verdict"]["deployable"]["move"] = moved(move)
     result["time_budget"] = {"ended": ended, "minutes": 5.0}
     found = decide(result)
-    reasons = {one.reason for one in found.findings}
+    reasons = {one.reason for one in found.concerns}
     assert found.builds != found.refuses
     if not verified or "failed" in states.values() or move in ("failed", "unknown"):
         assert found.refuses
@@ -80,10 +80,10 @@ def test_no_decision_builds_what_failed_or_is_not_known(
         assert judged.pop("predicted") in ("passed", "unknown")
         assert set(judged.values()) == {"passed"}
     else:
-        assert found.findings
+        assert found.concerns
     if found.builds:
         assert (Reason.BUDGET in reasons) == ended
-    for one in found.findings:
+    for one in found.concerns:
         assert one.words in found.words
     assert found.words == advice(result)
 

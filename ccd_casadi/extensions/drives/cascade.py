@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccd_casadi.extensions.drives.drive import Drive, Setting, Slot
+from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot
 from ccd_casadi.extensions.drives.forms import FORMS, Filter
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array

@@ -17,7 +17,7 @@ from ccd_casadi.support.terminal import inform, say
     option("--today", metavar="FILE.toml", type=Path,
            help="present values by number or name, shown beside the new ones"),
     valued("--starts", "N", integer(1), "starting points of the search", 24),
-    needs=["ccd_casadi.extensions.drives.design", "ccd_casadi.cases.case_problem"],
+    needs=["ccd_casadi.extensions.drives.drive_design", "ccd_casadi.cases.case_problem"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Design, write the folder, print the sheet."""
@@ -25,7 +25,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     from ccd_casadi.cases.case import load_case, parse_theta, read_toml
     from ccd_casadi.extensions.drives.arithmetic import program_of
-    from ccd_casadi.extensions.drives.design import DriveOptions, design_drive
+    from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.of_case import drive_problem
     from ccd_casadi.extensions.drives.sheet import entry, sheet_text
     from ccd_casadi.reporting.facts import run_name

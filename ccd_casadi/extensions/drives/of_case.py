@@ -10,8 +10,8 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.cases.controller_tables import DriveTable
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.design import require_known
-from ccd_casadi.extensions.drives.drive import Slot, read_drive
+from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
+from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.extensions.drives.search import Candidate, Search
+from ccd_casadi.extensions.drives.cascade_search import Candidate, Search
 from ccd_casadi.support.arrays import Array
 
 

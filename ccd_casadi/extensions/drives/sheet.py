@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.extensions.drives.design import DriveDesign
+from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.support.text import HZ
 
 
