@@ -47,7 +47,7 @@ class Build(StrEnum):
         The concerns are for the reader to weigh.
     NOT_YET, NO
         What it survives is not known, or a move does not settle; a line failed.
-    LOOK, NOT_VERIFIED, NOTHING
+    EXAMINE, NOT_VERIFIED, NOTHING
         Of a loop without a verdict, as `tune` makes it: concerns, no certificate, nothing to say.
     """
 
@@ -56,7 +56,7 @@ class Build(StrEnum):
     IF_ACCEPTED = "if_accepted"
     NOT_YET = "not_yet"
     NO = "no"
-    LOOK = "look"
+    EXAMINE = "examine"
     NOT_VERIFIED = "not_verified"
     NOTHING = "nothing"
 
@@ -67,7 +67,7 @@ SENTENCES = {
     Build.IF_ACCEPTED: "Build this only if you accept: {}.",
     Build.NOT_YET: "Do not build this yet: {}.",
     Build.NO: "Do not build this: {}.",
-    Build.LOOK: "Look at the loop before you run it: {}.",
+    Build.EXAMINE: "Look at the loop before you run it: {}.",
     Build.NOT_VERIFIED: "Do not run this: it is not verified.",
     Build.NOTHING: "",
 }
@@ -288,7 +288,7 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
         step = "more lines there, or more averages"
     if all(one.reason is Reason.CURRENT for one in concerns):
         step = NEXT["current"]
-    return Decision(Build.LOOK, concerns, (step,))
+    return Decision(Build.EXAMINE, concerns, (step,))
 
 
 def _loop_concerns(result: Mapping[str, Any]) -> tuple[Concern, ...]:
