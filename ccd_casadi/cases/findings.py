@@ -43,6 +43,9 @@ class FindingOptions:
         Delays in periods: a shorter one may have been written in seconds, a longer one not.
     decibel : float
         From here on a peak of S is more likely one in dB.
+    unlike : float
+        Factor between the motions of two sensors of one actuator beyond which a bound on KS counts
+        the noise of one of them alone: their units differ.
     """
 
     light: float = 0.3
@@ -52,6 +55,7 @@ class FindingOptions:
     least_delay: float = 1e-3
     most_delay: float = 100.0
     decibel: float = 3.0
+    unlike: float = 30.0
 
 
 # in SI, by how a person writes them
@@ -167,7 +171,7 @@ def loop_findings(
 ) -> list[Finding]:
     """Warnings about signs of sensors and actuators, and about the delay and the rate of the
     loop."""
-    words = _sign_words(problem, modal)
+    words = _sign_words(problem, modal) + _unit_words(problem, modal, options)
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if (run := problem.sampling) is not None:
         meant = facts.effort_hz if states_effort(problem) else np.nan
@@ -211,6 +215,21 @@ def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float =
                 "If not, correct the row or the column"
             )
     return words
+
+
+def _unit_words(problem: CoDesignProblem, modal: ModalPlant, options: FindingOptions) -> list[str]:
+    """Whether sensors on one actuator read in one unit, where one bound is on all their gains."""
+    if modal.B.shape[1] != 1 or len(modal.C) < 2 or not states_effort(problem):
+        return []
+    sizes = np.linalg.norm(modal.C, axis=1)
+    least, most = int(sizes.argmin()), int(sizes.argmax())
+    if not sizes[most] > options.unlike * sizes[least] > 0.0:
+        return []
+    return [
+        f"output {most + 1} moves {sizes[most] / sizes[least]:.3g} times as far as output "
+        f"{least + 1}: do they have one unit? weighted_level bounds KS of all sensors together, "
+        "so scale each row of output to the same unit (a motor's angle by the lead over 2 pi)"
+    ]
 
 
 def states_effort(problem: CoDesignProblem) -> bool:

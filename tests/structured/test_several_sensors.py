@@ -392,6 +392,19 @@ def test_a_reversed_sensor_is_named(
         assert f"{name} to negative values" in words
 
 
+@pytest.mark.parametrize(("scale", "named"), [(1.0, 0), (1e3, 1), (1e-3, 1)])
+def test_sensors_of_unlike_units_are_named(tmp_path: Path, scale: float, named: int) -> None:
+    """One bound on KS counts the gains of both: it has no meaning across units."""
+    rows = '"both": ca.DM([[1.0, 0.0], [0.0, 1.0]])'
+    plant, text = ((EXAMPLE / name).read_text() for name in ("plant.py", "case.toml"))
+    (tmp_path / "plant.py").write_text(plant.replace(rows, rows.replace("[1.0, ", f"[{scale}, ")))
+    for bound, count in (("", named), ("weighted_level", 0)):
+        lines = [line for line in text.splitlines() if not bound or bound not in line]
+        (tmp_path / "case.toml").write_text("\n".join(lines))
+        words = suspicions(problem_of(load_case(tmp_path / "case.toml")))
+        assert sum("one unit" in one for one in words) == count
+
+
 def test_a_sensor_that_reads_nothing_is_refused_by_name() -> None:
     plant = two_masses()
     system = control.ss(plant.A, plant.B, np.diag([0.0, 1.0]) @ plant.C, plant.D)

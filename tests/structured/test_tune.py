@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from oracles import random_tunes
 from oracles.helpers import few
 from scipy.io import savemat
 from scipy.signal import cont2discrete
@@ -23,8 +24,8 @@ from ccd_casadi.extensions.measured.command import main
 from ccd_casadi.extensions.measured.line_problem import line_problem
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import judge_lines, judge_loops
-from ccd_casadi.lti.loop import Sampling, tustin
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -74,6 +75,41 @@ def test_models_are_tuned_and_judged_apart(plant: object, rate: float, delay: in
         assert norm is not None
         assert S <= norm * (1.0 + 1e-6) <= 1.8 * (1.0 + 1e-6)
         assert norm == pytest.approx(S, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", [1053])
+def test_lines_are_added_until_the_model_agrees(seed: int) -> None:
+    """Light resonances make |S| between two lines exceed S_max: these plants were refused."""
+    found = random_tunes.run(seed, 2)
+    assert found["usable"], found["words"]
+    assert found["S_over_S_max"] <= 1.0
+    assert found["bandwidth_over_crossing"] <= 1.0 + 1e-6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_controller_of_steep_leads_keeps_the_digits_of_S(seed: int) -> None:
+    """|S| by the matrices of the closed loop, and by 1/(1 + GK): 1e-8, where the states of a
+    cascade, twenty decades apart, keep 1e-6 or nothing."""
+    rng = np.random.default_rng(seed)
+    structure = ccd.Structure(lead=3, biquads=1, roll_off=1)
+    period, omega, middle = 5e-4, HZ * np.geomspace(1.0, 900.0, 40), HZ * np.array([30.0])
+    kappa = np.log(HZ * 10.0 ** rng.uniform(0.0, 2.0, len(structure.names)))
+    for i, name in enumerate(structure.names):
+        if name.startswith("lead") and name.endswith("zero"):
+            kappa[i] = np.log(10.0 ** rng.uniform(-3.0, 0.0))
+        elif name.endswith("pole") or name.startswith("roll-off"):
+            kappa[i] = np.log(rng.uniform(1e3, 3e4))
+        elif "damping" in name:
+            kappa[i] = np.log(rng.uniform(0.1, 1.0))
+    G = StateSpace(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]),
+                   np.array([[1.0, 0.0]]), np.zeros((1, 1)))  # fmt: skip
+    held = sampled(G, period, 0.0)
+    crossing = held.response(middle) * tustin(structure.state_space(kappa), period).response(middle)
+    kappa[0] -= np.log(np.abs(crossing.item()))
+    K = tustin(structure.state_space(kappa), period)
+    by_product = 1.0 / (1.0 + held.response(omega) * K.response(omega))[:, 0, 0]
+    by_matrices = closed_loop(held, K).S.response(omega)[:, 0, 0]
+    np.testing.assert_allclose(by_matrices, by_product, rtol=1e-7)
 
 
 def test_every_form_of_a_plant_is_the_same_plant(tmp_path: Path) -> None:

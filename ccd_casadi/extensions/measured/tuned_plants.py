@@ -44,6 +44,9 @@ class LineOptions:
         Share of the largest root below which a root lies at 0.
     most_samples : int
         Samples of a delay at most.
+    nearby, halvings : float, int
+        Relative distance of the outermost line that is added beside a frequency, and how many lines
+        are added on each side, each at half the distance of the one before.
     """
 
     per_decade: int = 60
@@ -55,6 +58,8 @@ class LineOptions:
     apart: float = 1e-6
     at_rest: float = 1e-7
     most_samples: int = 1000
+    nearby: float = 0.02
+    halvings: int = 6
 
 
 def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
@@ -198,7 +203,9 @@ def with_lines_near(
     options: LineOptions = LineOptions(),
 ) -> MeasuredResponse:
     """With lines where |S| was too large between two, or the bandwidth ends, and nearby."""
-    nearby = np.linspace(0.98, 1.02, 9)  # nine lines within 2 %
+    # Closer by halves: what is narrow beside a light resonance of the plant moves with each design.
+    offsets = options.nearby * 0.5 ** np.arange(options.halvings)
+    nearby = np.concatenate([1.0 - offsets, [1.0], 1.0 + offsets])
     more = (np.array(omega)[:, None] * nearby).ravel() / HZ
     known = response.hz
     hz = frequency_grid(float(known[0]), float(known[-1]), 2, known, more, apart=options.apart)

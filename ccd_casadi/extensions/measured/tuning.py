@@ -52,6 +52,8 @@ class TuningOptions:
         Share of the bandwidth that is given up for integral gain.
     rounds : int
         Rounds of adding lines where the loop on the model is worse than on the lines.
+    most_starts : int
+        Up to which the starts are doubled after a search that found no usable controller.
     slower : float
         Relative loss of bandwidth between the lines of a model from which lines are added.
     per_decade : int
@@ -63,7 +65,8 @@ class TuningOptions:
     most_notches: int = 3
     inside: float = 2e-3
     given_up: float = 0.03
-    rounds: int = 5
+    rounds: int = 10
+    most_starts: int = 48
     slower: float = 1e-3
     per_decade: int = 200
     about_crossing: int = 41
@@ -220,17 +223,21 @@ def tune(
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
                                 effort=effort, given_up=options.given_up, initial=initial,
                                 progress=tell, workers=workers)  # fmt: skip
-        if not design.usable or not periods:
+        if not periods:
             break
         loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
         found = [loop for loop in loops if loop is not None]
         worse = [loop for loop in found if not loop.norm <= S_max]
         least = (1.0 - options.slower) * design.bandwidth
         slower = [loop for loop in found if loop.bandwidth < least]
-        if not worse and not slower:
+        if design.usable and not worse and not slower:
             break
-        inside, initial = inside * (2.0 if worse else 1.0), design.kappa
-        near = [loop.peak for loop in worse] + [place for loop in slower for place in loop.limits]
+        # A local search that ends outside its bounds is begun anew, with more starts.
+        initial = design.kappa if design.usable else None
+        inside *= 2.0 if design.usable and worse else 1.0
+        starts = starts if design.usable else min(2 * starts, max(starts, options.most_starts))
+        near = [place for loop in worse for place in loop.peaks]
+        near += [place for loop in slower for place in loop.limits]
         responses = tuple(one if G is None else with_lines_near(one, G, near)
                           for one, G in zip(responses, models, strict=True))  # fmt: skip
     norms: tuple[float | None, ...] = tuple(None for _ in models)
@@ -265,12 +272,14 @@ def _judged(
 
 @dataclass(frozen=True)
 class LoopOnModel:
-    """‖S‖∞ and its ω, the bandwidth at any frequency, and the ω that limit it; rad/s."""
+    """‖S‖∞ and its ω, the bandwidth at any frequency, the ω that limit it, and the ω of all maxima
+    of |S| that exceed S_max, or of unstable poles; rad/s."""
 
     norm: float
     peak: float
     bandwidth: float
     limits: tuple[float, ...]
+    peaks: tuple[float, ...]
 
 
 def _loops_on(
@@ -293,8 +302,10 @@ def _loop_on(
     """The loop with a model in discrete time; infinite and 0 where it is not stable."""
     S = closed_loop(G, tustin(K, G.period)).S
     norm, peak = hinf_norm(S)
-    if not np.isfinite(norm):
-        return LoopOnModel(norm, peak, 0.0, ())
+    if not np.isfinite(norm):  # the lines about the unstable poles missed a turn
+        rates = S.rates[S.rates.real >= 0.0]
+        near = np.abs(rates.imag[rates.imag > 0.0])
+        return LoopOnModel(norm, peak, 0.0, (), tuple(near.tolist()))
     top = np.pi / G.period
     roots = S.rates
     low = LineOptions.lowest * float(np.abs(roots).min())
@@ -314,12 +325,17 @@ def _loop_on(
         top_at = local_maxima(curve(omega))
         ends = omega[top_at - 1], omega[top_at + 1]
         omega = np.union1d(omega, zoomed(curve, *ends)[0])
-    found = bandwidth_within(omega, level(omega), bounds, integrator)
+    curve_S = level(omega)
+    tops = local_maxima(curve_S)
+    over = omega[tops[curve_S[tops] > np.log(bounds.S_max)]]
+    peaks = tuple(np.unique([peak, *over]).tolist()) if norm > bounds.S_max else ()
+    found = bandwidth_within(omega, curve_S, bounds, integrator)
     for _ in range(2):  # it lies at a crossing, or by the shape at a maximum that is there already
         i = int(np.clip(np.searchsorted(omega, found), 1, len(omega) - 1))
         omega = np.union1d(omega, np.linspace(omega[i - 1], omega[i], options.about_crossing))
         found = bandwidth_within(omega, level(omega), bounds, integrator)
-    return LoopOnModel(norm, peak, found, (found, float(omega[np.argmax(held(omega))])))
+    limits = found, float(omega[np.argmax(held(omega))])
+    return LoopOnModel(norm, peak, found, limits, peaks)
 
 
 def _on_models(
