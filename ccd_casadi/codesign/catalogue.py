@@ -11,6 +11,9 @@ optima that were found, so what is cut is no better as far as those hold. A sear
 bound shows by how much bounds may be wrong: all others are lowered by twice as much, and searches
 begin at what it has found.
 
+Where true values are cheap, exchanges give a combination to begin with (`exchange`): its design is
+verified before the first part is split, and cuts from there on.
+
 Source: Land and Doig, Econometrica 28 (1960).
 """
 
@@ -23,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.design_plants import order
+from ccd_casadi.codesign.exchange import best_exchange
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import constraint_shares
@@ -111,12 +115,14 @@ def best_of_lists(
     between: Search,
     at: Search,
     judge: Judge | None = None,
+    exchanges: bool = False,
     options: BranchOptions = BranchOptions(),
 ) -> Solution:
     """The best co-design with every listed parameter on a value of its list.
 
     `between` searches a part, `at` a combination, both near a solution that is given; with `judge`
-    what `at` finds is only good for its J, and the best is judged from there.
+    what `at` finds is only good for its J, and the best is judged from there. With `exchanges` the
+    first combination is that of `best_exchange`.
     """
     began, problem = perf_counter(), sampler.problem
     width = {name: high - low for name, low, high in
@@ -132,7 +138,8 @@ def best_of_lists(
     nodes: dict[tuple[tuple[float, ...], ...], Node] = {}
     known: list[Solution] = []
     best: Solution | None = None
-    judged, count = 0, open_[0].count
+    exchanged: Lists = {}
+    judged, tried, count = 0, 0, open_[0].count
     most = count // 2 if count > options.few else 0
     while open_:
         part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
@@ -145,6 +152,8 @@ def best_of_lists(
         if nodes and ends_early("listed combination", left):
             break
         open_.remove(part)
+        if part.lists == exchanged:
+            continue  # it was designed before the first part was split
         if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
             rows = product(*([(v,) for v in values] for values in part.lists.values()))
             open_ += [replace(part, lists=dict(zip(part.lists, row, strict=True))) for row in rows]
@@ -180,6 +189,16 @@ def best_of_lists(
             ]
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
+        if exchanges and len(nodes) == 1 and not whole and np.isfinite(J):
+            exchanged, tried = _exchanged(problem, each, found, options)
+            own = restricted(problem, exchanged)
+            best = at(sampler.of(own), found)
+            best = replace(best, problem=best.problem or own)
+            J = best.result.get("objective", np.inf)
+            words = _made_of(problem, best.result)
+            node = Node(exchanged, best.result["status"], J, words)
+            nodes[tuple(exchanged.values())] = node
+            known += [best] if np.isfinite(J) else []
         remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
     if best is None:  # the time was up
         with stage(StageOptions.ending):
@@ -189,13 +208,24 @@ def best_of_lists(
         nodes[tuple(lists.values())] = node
     result = with_all_spent(best.result, sampler.spent.by_purpose) | {
         "seconds": perf_counter() - began,
-        "listed": _listed(problem, best, [*nodes.values()], open_, judged),
+        "listed": _listed(problem, best, [*nodes.values()], open_, judged) | {"exchanged": tried},
     }
     words = _words(problem, result)
     notes = [*result.get("notes", ()), words]
     if result["status"] == "infeasible":
         result["reason"] = "; ".join(filter(None, (result["reason"], words)))
     return replace(best, result=result | {"notes": notes})
+
+
+def _exchanged(
+    problem: CoDesignProblem, sampler: Sampler, free: Solution, options: BranchOptions
+) -> tuple[Lists, int]:
+    """The combination that exchanges find from an optimum between the values, and how many they
+    evaluated."""
+    theta = dict(zip(problem.names, problem.start, strict=True)) | _point(free)
+    begin = {name: values[0] for name, values in _nearest(problem, theta, options).items()}
+    found, tried = best_exchange(sampler, dict(problem.listed), theta, begin)
+    return {name: (value,) for name, value in found.items()}, tried
 
 
 def _in_the_time_left(
@@ -352,6 +382,8 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         figures = f" ({there} there, {here} here)" if there else ""
         free = f"; J is {far} the best with any value between them{figures}"
     counts = f"{found['solved']} of {counted(found['combinations'], 'combination')} searched"
+    if found["exchanged"]:
+        counts += f", {found['exchanged']} evaluated at the theta of the first of these parts"
     if found["between"]:
         counts += f", and {counted(found['between'], 'part')} with any value between them"
     if found["cut"] and found["least_of_cut"] is not None:

@@ -243,4 +243,5 @@ def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution
         sampler,
         lambda each, near: co_design(each, quick, seed),
         lambda each, near: co_design(each, formulation, seed),
+        exchanges=True,
     )
