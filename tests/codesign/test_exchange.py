@@ -1,7 +1,6 @@
 """Exchanges of listed values: what they find, and what they cost."""
 
 import itertools
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
