@@ -192,6 +192,11 @@ class Outer(ABC):
         are none."""
         return None
 
+    def refuted(self, verified: Verified) -> "Outer | None":
+        """This, with the plants by which the judge refutes a design, to search again from it; None
+        where there are none."""
+        return None
+
     def with_training_sample(
         self, outcome: FormulationResult, end: PolishedDesign
     ) -> FormulationResult:

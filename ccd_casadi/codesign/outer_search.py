@@ -189,12 +189,14 @@ class SearchResult:
 
 
 def search_outer(
-    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None, most: int = 3
-) -> SearchResult:
+    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None, most: int = 3,
+    ending: float = StageOptions.ending,
+) -> SearchResult:  # fmt: skip
     """Formulation and polish, again with what the inner problem at the end has found better: `most`
     rounds.
 
-    `known`: x of a local optimum that another search has found, in place of the formulation.
+    `known`: x of a local optimum that another search has found, in place of the formulation;
+    `ending`: share of the budget until which ends are polished.
     """
     outer = outer.prepared(seed)
     end: PolishedDesign | None = None
@@ -209,7 +211,7 @@ def search_outer(
             outcome = replace(outcome, x=_at_hand(outer, end))
         if outcome.x is None:
             return SearchResult(outer, outcome, None, rounds)
-        with stage(StageOptions.ending):
+        with stage(ending):
             try:
                 end = outer.polished(outcome.x)
             except NoDesign as error:

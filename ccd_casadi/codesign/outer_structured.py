@@ -8,7 +8,7 @@ The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -29,6 +29,7 @@ from ccd_casadi.codesign.stored_searches import (
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
 from ccd_casadi.codesign.theta_kkt import theta_kkt
+from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
@@ -39,7 +40,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import Scenario
-from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
@@ -85,15 +86,18 @@ class PolishedStructured(PolishedDesign):
 
 
 class StructuredOuter(ThetaOuter):
-    """See the module; `words` say why the search at the start found no warm starts, and where one
-    `ended` before, no places far from there are tried again."""
+    """See the module; `words` say why the search at the start found no warm starts, where one
+    `ended` before, no places far from there are tried again, and `repairs` counts designs that the
+    judge has refuted: each is judged on a lattice of its own."""
 
     kkt_level = VerifiedStructured.kkt_level
     structured_options = StructuredOuterOptions()
 
-    def __init__(self, sampler: Sampler, words: str = "", ended: bool = False) -> None:
+    def __init__(
+        self, sampler: Sampler, words: str = "", ended: bool = False, repairs: int = 0
+    ) -> None:
         super().__init__(sampler)
-        self.words, self.ended = words, ended
+        self.words, self.ended, self.repairs = words, ended, repairs
 
     @property
     def retries_pay(self) -> bool:
@@ -182,14 +186,25 @@ class StructuredOuter(ThetaOuter):
         if not end.scenarios:
             return None
         anchored = with_warm_start(end.sampler.problem, end.inner.design.kappa)
-        return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios), ended=True)
+        sampler = with_scenarios(end.sampler.of(anchored), end.scenarios)
+        return StructuredOuter(sampler, ended=True, repairs=self.repairs)
+
+    def refuted(self, verified: Verified) -> "StructuredOuter | None":
+        verified = cast(VerifiedStructured, verified)
+        if not verified.counterexamples:
+            return None
+        anchored = with_warm_start(verified.problem, verified.design.kappa)
+        sampler = with_scenarios(self.sampler.of(anchored), verified.counterexamples)
+        return StructuredOuter(sampler, ended=True, repairs=self.repairs + 1)
 
     def verified(self, end: PolishedDesign, rounds: int) -> VerifiedStructured:
         end = cast(PolishedStructured, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
         design = recertified(problem, best.theta, design)  # what a store holds is not relied on
-        on_box = DesignOnBox(problem, best.theta, design)
+        judging = BoxCheckOptions()
+        judging = replace(judging, lattice_seed=judging.lattice_seed + self.repairs)
+        on_box = DesignOnBox(problem, best.theta, design, judging)
         multistart = end.multistart
         if multistart is None and not ends_early("multi-start check"):
             multistart = multistart_at(sampler, best)
@@ -244,6 +259,7 @@ class StructuredOuter(ThetaOuter):
             gap=gap,
             told=told,
             second=second,
+            counterexamples=on_box.counterexamples(wide, proof, worst),
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -1,6 +1,6 @@
 """One co-design: sample, fit, solve with IPOPT, verify."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -32,8 +32,21 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PoolOptions, Workers
-from ccd_casadi.support.time_budget import within_budget
+from ccd_casadi.support.time_budget import StageOptions, ends_early, stage, within_budget
 from ccd_casadi.support.worker_process import one_blas_thread
+
+
+@dataclass(frozen=True)
+class RepairOptions:
+    """Numbers of searches from a design that its judge refutes.
+
+    Attributes
+    ----------
+    most : int
+        How often the plants of the judge join the set.
+    """
+
+    most: int = 2
 
 
 @one_blas_thread
@@ -163,7 +176,24 @@ def co_design(
         return conclude_at(outer_of(sampler), FormulationResult(message=forbidden), terms)
 
     def solved(outer: Outer) -> Solution:
-        return conclude(search_outer(outer, formulation, seed, known), terms)
+        """Searched and judged; again with the plants by which the judge refutes the design."""
+        found = search_outer(outer, formulation, seed, known)
+        solution = conclude(found, terms)
+        for _ in range(RepairOptions.most):
+            if found.end is None or solution.verified is None:
+                break
+            more = found.outer.refuted(solution.verified)
+            if more is None:
+                break
+            with stage(StageOptions.repair):
+                if ends_early("repair of a refuted design"):
+                    break
+                again = search_outer(more, formulation, seed, found.end.x,
+                                     ending=StageOptions.repair)  # fmt: skip
+            if again.end is None:
+                break
+            found, solution = again, conclude(again, terms)
+        return solution
 
     return best_over_design_plants(sampler, outer_of, solved, terms)
 

@@ -35,6 +35,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     with_structured,
 )
+from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
@@ -104,6 +105,8 @@ class VerifiedStructured(Verified):
         Of ω_b: what no controller reaches.
     told : (float, Yield) or None
         The time of its move in s, where J counts it.
+    counterexamples : tuple of (option, point)
+        Plants of the box by which judge or proof refute the design.
     """
 
     design: SectionsDesign
@@ -118,6 +121,7 @@ class VerifiedStructured(Verified):
     prices: Mapping[str, float]
     gap: Gap | None
     told: tuple[float, Yield | None] | None = None
+    counterexamples: tuple[Scenario, ...] = ()
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.

@@ -71,8 +71,10 @@ class JudgeOptions:
         To either side of a resonance beyond half the rate.
     points : int
         Of the grid there.
-    rest : float
-        Of the grid's lowest frequency: counts as 0 Hz.
+    rest : tuple of float
+        Shares of the grid's lowest frequency: the least that keeps its digits counts as 0 Hz.
+    lost : float
+        Relative: rounding of S there, at most.
     curves : CurveOptions
     """
 
@@ -81,7 +83,8 @@ class JudgeOptions:
     rounding: float = 1e3 * float(np.finfo(float).eps)
     half_widths: float = 3.0
     points: int = 240
-    rest: float = 1e-3
+    rest: tuple[float, ...] = (0.5, 0.1, 0.01, 1e-3)
+    lost: float = 1e-7
     curves: CurveOptions = field(default_factory=CurveOptions)
 
 
@@ -238,10 +241,10 @@ def judged(
         grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner,
                                   options.curves))  # fmt: skip
     grid, rows = padded(grids), np.arange(len(good))
-    if not integrator:
-        grid = np.concatenate([options.rest * grid[:, :1], grid], axis=1)
     table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
                           integrator)  # fmt: skip
+    if not integrator:
+        grid = np.concatenate([_at_rest(table, grid[:, :1], options), grid], axis=1)
     if len(free[0].C) > 1 and bounds.error is None:
         grid, values = with_crossings(table, grid, options.curves)
     else:
@@ -296,6 +299,20 @@ def judged(
             channels=tuple(channels[k]),
         )
     return found
+
+
+def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Array:
+    """The frequency (P, 1) that counts as 0 Hz of every plant, below its `lowest` (P, 1), rad/s.
+
+    Rounding of L of a size ‖L‖ changes S = (I + L)⁻¹ by S δL S, so by eps ‖L‖/(1 + σ_min(L)) of
+    itself: without an integrator beside channels of free bodies, whose |L| grows without bound,
+    nothing would be left of it at too low a frequency.
+    """
+    shares = np.sort(options.rest)
+    sizes = table.open_loops(np.arange(len(lowest)), lowest * shares)
+    kept = np.finfo(float).eps * sizes[..., -1] / (1.0 + sizes[..., 0]) <= options.lost
+    first = np.where(kept.any(axis=1), kept.argmax(axis=1), len(shares) - 1)
+    return np.asarray(lowest * shares[first][:, None])
 
 
 def _raised(

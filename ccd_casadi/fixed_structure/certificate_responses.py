@@ -197,6 +197,11 @@ class LoopResponses:
             return np.asarray(np.abs(entry_of(self.bounds.channels[self.bounds.error], S)))
         return sigma_max(S) if row is None else _length(row, S)
 
+    def open_loops(self, which: np.ndarray, omega: Array) -> Array:
+        """All singular values (N, k, p) of L = GK, the least first, as `at`."""
+        _, g, k = self._loops(which, omega)
+        return np.asarray(np.linalg.svd(_product(g, k), compute_uv=False)[..., ::-1])
+
     def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
         S, g, k = self._loops(which, omega)
         free = g if self.free is None else self.free.at(which, 1j * omega)

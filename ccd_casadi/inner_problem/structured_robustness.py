@@ -61,8 +61,8 @@ class BoxCheckOptions:
         Plants added to the set in a round, at most.
     apart : float
         Of the box: plants that are closer are the same plant.
-    lattice : int
-        Plants that the judge sees in the end.
+    lattice, lattice_seed : int
+        Plants that the judge sees in the end, and what is added to the problem's seed to draw them.
     looseness : float
         Relative: by how much they exceed a bound.
     fresh : int
@@ -76,6 +76,7 @@ class BoxCheckOptions:
     added: int = 8
     apart: float = 1e-4
     lattice: int = 200
+    lattice_seed: int = 1000
     looseness: float = 2.0 * WorstPlantOptions.within
     fresh: int = 3000
     fresh_of_several: int = 300
@@ -140,24 +141,49 @@ class DesignOnBox:
                 break
         return largest, added
 
+    def lattice_points(self, worst: Excess) -> list[tuple[int, Array]]:
+        """The plants of the judge: a lattice of the box, the worst plant and those of the set."""
+        structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
+        if not uncertain.names:
+            return list(uncertain.corners()[: 1 + len(structured.uncertainty.options)])
+        points = lattice(uncertain, options.lattice, structured.seed + options.lattice_seed)
+        known = [(option, np.array(point)) for option, point in structured.scenarios]
+        return [*points, (worst.option, worst.point), *known]
+
     def on_lattice(self, worst: Excess, workers: Pool | None = None) -> tuple[SetCertificate, int]:
-        """The independent judge on a lattice of the box and the worst plant; how many plants it
-        saw.
+        """The independent judge on `lattice_points`; how many plants it saw.
 
         The bounds count as met within `looseness`, since the search stops at half of it.
         """
-        structured, uncertain = structured_of(self.problem), self.uncertain
-        points = lattice(uncertain, self.options.lattice, structured.seed + 1000)
-        points = [*points, (worst.option, worst.point)]
-        if not uncertain.names:
-            points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
-        else:
-            points += [(option, np.array(point)) for option, point in structured.scenarios]
-        K = self.design.controller
+        points, K = self.lattice_points(worst), self.design.controller
         assert K is not None
         require_as_returned(self.problem, self.theta)
-        plants, loose = uncertain.as_written(points), self.options.looseness
+        plants, loose = self.uncertain.as_written(points), self.options.looseness
         return _judged(self.problem, plants, K, loose, workers), len(points)
+
+    def counterexamples(
+        self, wide: SetCertificate, proof: "Proof", worst: Excess
+    ) -> tuple[Scenario, ...]:
+        """Plants of the box by which judge and proof refute the design, the worst first.
+
+        Not those that are drawn for the yield: a design that was changed by these makes its
+        statement void.
+        """
+        if not self.uncertain.names:
+            return ()
+        bounds, structured = bounds_of(self.problem), structured_of(self.problem)
+        level = (1.0 + self.options.looseness) * (1.0 + JudgeOptions.tolerance)
+        found: list[tuple[float, Scenario]] = []
+        for one, (option, point) in zip(wide.plants, self.lattice_points(worst), strict=True):
+            shares = bounds.shares(one) | bounds.channel_shares(one.channels)
+            excess = max(shares.values(), default=np.inf) if one.stable else np.inf
+            if not excess <= level:
+                found.append((float(excess), (option, tuple(map(float, point)))))
+        found.sort(key=lambda pair: -pair[0])
+        if proof.refuted:
+            found.insert(0, (np.inf, (proof.option, tuple(map(float, proof.point)))))
+        fresh = dict.fromkeys(plant for _, plant in found if plant not in structured.scenarios)
+        return tuple(fresh)[: self.options.added]
 
     def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
         """Judge plants that are drawn uniformly from the box: how many keep every bound and ω_b.

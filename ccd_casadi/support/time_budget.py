@@ -28,6 +28,7 @@ class StageOptions:
     start: float = 0.3  # the search for a first controller
     search: float = 0.6  # over θ
     ending: float = 0.75  # of the best one: polish, worse plants, wider searches at its θ
+    repair: float = 1.0  # of a design that the judge refuted
 
 
 @dataclass

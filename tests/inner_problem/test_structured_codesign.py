@@ -15,14 +15,25 @@ from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer import pieces_from
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
+from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure, certify
+from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_plant_set import (
+    bounds_of,
+    structured_of,
+    uncertain_plant,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
-from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, certify_corners
+from ccd_casadi.inner_problem.structured_robustness import (
+    BoxCheckOptions,
+    DesignOnBox,
+    certify_corners,
+)
 from ccd_casadi.inner_problem.structured_search import StructuredSearchOptions, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -137,6 +148,41 @@ def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) 
     assert plants > 200
     wild = replace(made.controller, C=1.2 * made.controller.C)
     assert not certify_corners(anchored, theta, wild).passed
+
+
+def test_plants_that_refute_a_design_join_the_set(
+    anchored: CoDesignProblem, tmp_path: Path
+) -> None:
+    """Of a design for the model alone, judged on the box: each plant exceeds a bound with it, the
+    next search knows them, and its design keeps them."""
+    theta, options = anchored.start, BoxCheckOptions(lattice=24, added=3)
+    scenarios = structured_of(anchored).scenarios
+    alone = with_structured(anchored, scenarios=scenarios[:1])
+    made = structured_value(alone, theta).design
+    on_box = DesignOnBox(alone, theta, made, options)
+    worst = on_box.worst()[0]
+    wide, _ = on_box.on_lattice(worst)
+    found = on_box.counterexamples(wide, Proof(ProofOutcome.PROVEN, 0.0, ()), worst)
+    assert made.certified
+    assert not wide.passed
+    assert 1 <= len(found) <= options.added
+    assert not set(found) & set(scenarios[:1])
+    uncertain = uncertain_plant(alone, theta)
+    for option, point in found:
+        plants = uncertain.as_written([(option, np.array(point))])
+        assert made.controller is not None
+        assert not certify(plants, made.controller, bounds_of(alone), alone.sampling).passed
+    verified = SimpleNamespace(counterexamples=found, problem=alone, design=made)
+    with Workers(1) as pool, SampleStore(tmp_path / "a.sqlite") as store:
+        outer = StructuredOuter(Sampler(alone, store, pool))
+        more = outer.refuted(verified)  # type: ignore[arg-type]
+        assert more is not None
+        assert more.repairs == outer.repairs + 1  # so that another lattice judges
+        assert structured_of(more.problem).scenarios == (*scenarios[:1], *found)
+        again = structured_value(more.problem, theta).design
+    assert again.certified
+    assert again.bandwidth <= made.bandwidth
+    assert outer.refuted(SimpleNamespace(counterexamples=())) is None  # type: ignore[arg-type]
 
 
 def test_the_range_of_frequencies_is_that_of_the_start() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from oracles.fixed_structure_channels import BOUNDS, FAST, assert_derivatives, plant
+from scipy.linalg import block_diag
 from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
@@ -21,6 +22,7 @@ from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.text import HZ
 
 ROOT = Path(__file__).resolve().parents[2]
 BOTH = given_decoupling(("coarse", "fine"), [[1], [1]], [[1, 0], [0, 1]])
@@ -112,6 +114,42 @@ def test_the_judge_sees_a_loop_at_rest_with_one_integrator_of_two(
     found = certify([first], still, BOUNDS, sampling, integrator=False).plants[0]
     expected = np.linalg.norm(g) / abs(1.0 + (g @ k).item())
     assert found.static_compliance == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("sampling", [None, Sampling(1e4, 100.0)])
+@pytest.mark.parametrize("inertia", [0.3, 1.0])
+def test_at_rest_a_channel_keeps_its_digits_beside_one_of_a_free_body(
+    sampling: Sampling | None, inertia: float
+) -> None:
+    """|L| of a free channel with an integrator is 1e20 at a microhertz: rounding of it was all that
+    was left of a sprung one without, and |T| 20 where it is 1.5. Channels alone know no other."""
+    U = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+    twist = StateSpace(np.array([[0.0, 1.0], [-((HZ * 40.0) ** 2), -10.0]]),
+                       np.array([[0.0], [1.0 / inertia]]), np.array([[1.0, 0.0]]),
+                       np.zeros((1, 1)))  # fmt: skip
+    free = StateSpace(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]),
+                      np.array([[1.0, 0.0]]), np.zeros((1, 1)))  # fmt: skip
+    A, B, C = (block_diag(getattr(free, n), getattr(twist, n)) for n in "ABC")
+    whole = StateSpace(A, B @ U.T, U @ C, np.zeros((2, 2)))
+    lead = Structure(lead=1, biquads=0, roll_off=1)
+    slow = Structure(integrator=False, lead=0, biquads=0, roll_off=1)
+    gain = (HZ * 30.0) ** 2
+    kappas = (np.log([gain / 3.0, HZ * 0.5, HZ * 10.0, HZ * 300.0, HZ * 900.0]),
+              np.log([50.0 * inertia * (HZ * 40.0) ** 2 / 400.0, HZ * 3.0]))  # fmt: skip
+    K = [one.state_space(kappa) for one, kappa in zip((lead, slow), kappas, strict=True)]
+    parts = [block_diag(*(getattr(one, n) for one in K)) for n in "ABCD"]
+    joint = StateSpace(parts[0], parts[1] @ U.T, U @ parts[2], U @ parts[3] @ U.T)
+    bounds = Bounds(S_max=4.0, S_low=1.0, omega_low=HZ, shape=None)
+    together = certify([whole], joint, bounds, sampling, integrator=False).plants[0]
+    each = [certify([G], k, bounds, sampling, integrator=own.integrator).plants[0]
+            for G, k, own in zip((free, twist), K, (lead, slow), strict=True)]  # fmt: skip
+    assert together.stable
+    assert all(one.stable for one in each)
+    for name in ("S_peak", "KS", "T"):
+        assert getattr(together, name) == pytest.approx(
+            max(getattr(one, name) for one in each), rel=1e-4
+        )
+    assert together.static_compliance == pytest.approx(each[1].static_compliance, rel=1e-3)
 
 
 @pytest.mark.slow
