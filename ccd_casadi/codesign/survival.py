@@ -419,7 +419,13 @@ def survival(
         delay=margins.delay,
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
-        statics=statics(nominal.plant, loops.controller, bandwidth=bandwidth, omega_low=omega_low),
+        statics=statics(
+            nominal.plant,
+            loops.controller,
+            bandwidth=bandwidth,
+            omega_low=omega_low,
+            places=loops.places,
+        ),
         contradiction=denied,
         S_max_slack=exceeded,
     )

@@ -54,7 +54,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     else:
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
-        name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
+        name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
         other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,

@@ -1,9 +1,11 @@
 """The loop at rest, and its largest compliance: what a force moves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
@@ -81,6 +83,7 @@ def statics(
     *,
     bandwidth: float,
     omega_low: float,
+    places: Sequence[BreakPoint] = (),
     options: StaticsOptions = StaticsOptions(),
 ) -> Statics:
     """Stiffness and compliance of a loop at rest.
@@ -94,6 +97,9 @@ def statics(
         The plant continuous; SI.
     bandwidth, omega_low : float
         ω_b and the lowest frequency that counts, rad/s.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: K is then the force per motion of the first, whose error
+        counts, while one force moves them all.
     options : StaticsOptions
         Numbers of the method.
 
@@ -103,11 +109,17 @@ def statics(
         SI.
     """
 
+    row = np.array([places[0].output]) if places else np.eye(len(plant.C))
+
+    def moved(omega: float) -> np.ndarray:
+        return plant.response(np.array([max(omega, options.resting * omega_low)]))[0]
+
     def at(omega: float) -> np.ndarray:
-        return controller.response(np.array([omega]))[0]
+        K = controller.response(np.array([omega]))[0]
+        return K @ moved(omega) / (row @ moved(omega)) if places else K
 
     def compliance(omega: float, K: np.ndarray) -> float:
-        G = plant.response(np.array([max(omega, options.resting * omega_low)]))[0]
+        G = row @ moved(omega)
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))
