@@ -1,7 +1,7 @@
 """Motors that are designed with the plant: the cycle of a move, its forces and heat; their mass."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, ClassVar
@@ -96,12 +96,15 @@ class Motion:
         From its end to the next, s.
     motor : Motor or None
         None: it does not limit.
+    output : tuple of float (p,)
+        Of several sensors on one actuator: uᵀy moves; empty: the first output.
     """
 
     limits: MoveLimits
     window: float
     dwell: float = 0.0
     motor: Motor | None = None
+    output: tuple[float, ...] = field(default=(), repr=False)  # which the controller says, too
 
     @property
     def required(self) -> bool:
@@ -314,7 +317,11 @@ class DrivenMechanics:
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
         """The move at θ. Raises UserError where a spring holds the output."""
-        free = without_hidden_rigid_modes(modal_plant(self(theta), FREE))
+        found, row = self(theta), np.array([self.motion.output])
+        if self.motion.output:
+            own = (*found.derivatives[:4], row @ found.derivatives[4])
+            found = replace(found, C=row @ found.C, derivatives=own)
+        free = without_hidden_rigid_modes(modal_plant(found, FREE))
         bare = scale_plant(free, 1.0, bare=True)
         return motion_at(self.motion, bare, self.mass(theta), self.place, sampling)
 

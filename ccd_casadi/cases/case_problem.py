@@ -17,7 +17,7 @@ from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem,
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import require_motion
-from ccd_casadi.inner_problem.structured_plant_set import with_options
+from ccd_casadi.inner_problem.structured_plant_set import break_points_of, with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.lti.wiring import Wiring
 from ccd_casadi.plants.modal import Suspension
@@ -119,7 +119,10 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         problem.controller.require_plants(plants)
         if math.isnan(problem.weights.M_K):
             problem = _with_a_scale(problem)
-        if problem.source.motion is not None:
+        if (motion := problem.source.motion) is not None:
+            if places := break_points_of(problem):  # the one whose error counts moves
+                motion = replace(motion, output=places[0].output)
+                problem = replace(problem, source=replace(problem.source, motion=motion))
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:

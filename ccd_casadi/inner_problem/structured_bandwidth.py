@@ -21,6 +21,7 @@ from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
+    break_points_of,
     plants_of,
     structure_of,
     structured_of,
@@ -79,7 +80,8 @@ def require_motion(problem: CoDesignProblem) -> None:
         The plant has unlike numbers of inputs and outputs, or the move cannot be made.
     """
     plant = plant_of(problem)
-    if plant.inputs != plant.outputs:
+    motion = problem.source.motion
+    if plant.inputs != plant.outputs and not (motion and motion.output):
         words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
         raise PlantError(f"{words} of one as of the other")
     motion_of(problem, problem.start)
@@ -101,10 +103,10 @@ def exact_moves(
     list of Move
         Of each plant.
     """
-    profile = motion.cycle.profile
+    profile, places = motion.cycle.profile, break_points_of(problem)
     return [
         simulate(
-            Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
+            Loop(plant.plant_si(), K, problem.sampling, places), profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
             bandwidth_hz=MoveCheckOptions.steps / profile.duration,
         )

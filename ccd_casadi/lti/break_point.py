@@ -1,12 +1,10 @@
 """Where the loop of several sensors on one actuator is broken, and what is left there."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.lti.state_space import ClosedLoop, StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.lti.state_space import ClosedLoop
 
 
 @dataclass(frozen=True)
@@ -51,34 +49,3 @@ class BreakPoint:
             return replace(loop, B_r=loop.B_d, C_y=-loop.C_u, D_u=none)
         row, column = np.array([self.output]), np.array([self.reference]).T
         return replace(loop, B_r=loop.B_r @ column, C_y=row @ loop.C_y, D_u=loop.D_u @ column)
-
-
-def course(
-    plant: StateSpace, axis: int = 0, places: Sequence[BreakPoint] = (), *, slow: float = 1e-5
-) -> tuple[Array, Array]:
-    """Find what follows a setpoint, uᵀy, and the reference r of every output per setpoint.
-
-    One output has its own setpoint. Of several sensors on one actuator that follows it whose error
-    counts, and all have what they read of a force that moves the plant slowly: r = G/(uᵀG).
-
-    Parameters
-    ----------
-    plant : StateSpace
-        G, continuous, SI.
-    axis : int
-        The output, from 0; of several sensors on one actuator it is given by the first place.
-    places : sequence of BreakPoint
-    slow : float
-        Of the plant's slowest pole: the real s at which G is taken.
-
-    Returns
-    -------
-    u, r : array (p,)
-    """
-    if not places:
-        unit = np.eye(len(plant.C))[axis]
-        return unit, unit
-    output, rates = np.array(places[0].output), np.abs(plant.poles)
-    moving = rates[rates > slow**2 * rates.max()]  # a free body has poles at 0
-    G = plant.at(np.array([slow * moving.min(initial=rates.max())]))[0, :, 0].real
-    return output, G / (output @ G)

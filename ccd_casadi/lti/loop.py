@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
+from ccd_casadi.lti.ports import Ports, ports_of
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
     StateSpace,
@@ -267,12 +268,22 @@ class Loop:
     at : tuple of BreakPoint
         Of several sensors on one actuator: first where the error counts, of which responses and S
         are, then the other places, which `peak` has too.
+    drive, counted : array (n, q), (z, n), optional
+        Where disturbing forces act and what of the states counts, where that is not the plant's own
+        B and C.
     """
 
     plant: StateSpace
     controller: StateSpace
     sampling: Sampling | None = None
     at: tuple[BreakPoint, ...] = ()
+    drive: Array | None = None
+    counted: Array | None = None
+
+    @cached_property
+    def ports(self) -> Ports:
+        """Where disturbing forces act, and what counts."""
+        return ports_of(self.plant, self.at, self.drive, self.counted)
 
     @property
     def places(self) -> "list[Loop]":
