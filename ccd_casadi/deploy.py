@@ -98,9 +98,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         )  # fmt: skip
         if found.stable:
             moved = on_hardware(
-                finished.plant.plant_si(), found.realisation, found.delay,
+                finished.loop.plant, found.realisation, found.delay,
                 finished.figures.bandwidth, limits=move_limits(options), window=options.window,
                 hardware=electronics, places=kind.bounds().places,
+                ports=finished.loop.ports if finished.loop.ported else None,
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one

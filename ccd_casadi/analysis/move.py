@@ -250,7 +250,11 @@ def simulate(
         ahead[2 if forces.ndim == 1 else slice(None)] = forces
     output, reference = course(loop.plant, axis, loop.at)
     closed, tail = closed_loop(*loop.as_run), options.tail / bandwidth_hz
-    row = output @ closed.C_y
+    rows, wanted = (output @ closed.C_y)[None], np.ones(1)
+    if loop.counted is not None:
+        rows = np.zeros((len(loop.counted), len(closed.A)))
+        rows[:, : len(loop.plant.A)] = loop.counted
+        wanted = loop.ports.wanted[:, 0 if loop.at else axis]
     ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz
     step = loop.period or float(np.clip(profile.duration / options.steps_per_move, *ends))
     A, drive = _over(loop, ahead, reference, step)
@@ -261,15 +265,16 @@ def simulate(
         if loop.period is None:
             _switch(driven, loop, ahead, reference, profile, step)
         x = states(A, driven)
-        error = r[0] - x @ row
+        error = np.outer(r[0], wanted) - x @ rows.T
         if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
             break
         tail *= 2.0
     force = x @ closed.C_u.T + np.outer(r[0], closed.D_u @ reference) + r.T @ ahead
     end = r[0, -1]  # whose derivatives are zero
-    rest = end - end * row @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
+    rest = end * wanted - end * rows @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
+    error = error[:, 0] if len(wanted) == 1 else error
     return Move(time, r[0], error, force, forces is not None,
-                profile.duration, window, rest=abs(float(rest)))  # fmt: skip
+                profile.duration, window, rest=float(np.abs(rest).max()))  # fmt: skip
 
 
 def _over(loop: Loop, ahead: Array, reference: Array, step: float) -> tuple[Array, Array]:

@@ -22,7 +22,13 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.objective import final_design
-from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    free_modal,
+    plant_of,
+    scaled_plant,
+    with_ports,
+)
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
@@ -120,6 +126,13 @@ class FinishedRun(NotebookHtml):
         case has it."""
         found = loop_on(self.problem, plant, self.controller)
         return found if self.sampling is None else replace(found, sampling=self.sampling)
+
+    @property
+    def loop(self) -> Loop:
+        """The loop on the model, as it runs, with its ports."""
+        wide = with_ports(self.problem)
+        plant = self.plant if wide is self.problem else scaled_plant(wide, self.theta)
+        return self.loop_on(plant.plant_si())
 
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""

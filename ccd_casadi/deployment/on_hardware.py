@@ -15,7 +15,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
 from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import DelayOptions
-from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.ports import Ports, course
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -98,16 +98,18 @@ def move(
     *,
     axis: int = 0,
     places: Sequence[BreakPoint] = (),
+    ports: Ports | None = None,
     forward: Array | None = None,
     window: float = 1e-6,
     hardware: Electronics | None = None,
     options: SimulationOptions = SimulationOptions(),
 ) -> Move:
     """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None. Of several
-    sensors on one actuator that of the first place, with references as of `course`."""
+    sensors on one actuator that of the first place, with references as of `course`. The error is
+    that of the `ports`, where they count something else."""
     hardware = hardware or Electronics()
     K, T = realisation.system, realisation.system.period
-    n, m, p = len(plant.A), len(K.C), len(plant.C)
+    n, m = len(plant.A), len(K.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
     wanted, (output, reference) = profile.at(time), course(plant, axis, places)
@@ -127,13 +129,16 @@ def move(
         return np.asarray(expm(joint * (T * share))[:n])
 
     x, z, u_now = np.zeros(n), np.zeros(len(K.A)), np.zeros(m)
-    error, force = np.zeros((count, p)), np.zeros((count, m))
+    rows, aim = (output[None] @ plant.C, np.ones(1)) if places else (plant.C, reference)
+    if ports is not None:
+        rows, aim = ports.counted, ports.wanted[:, 0 if places else axis]
+    error, force = np.zeros((count, len(aim))), np.zeros((count, m))
     limit, gain = realisation.saturation, realisation.back_calculation
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
         r = reference * wanted[0, k]
-        error[k] = r - y
+        error[k] = aim * wanted[0, k] - rows @ x
         e = r - _stepped(y, hardware.sensor_step)
         v = K.C @ z + K.D @ e + ahead[k]
         u = v if limit is None else np.clip(v, -limit, limit)
@@ -151,8 +156,6 @@ def move(
             step = over(round(following - now, 9))
             x = step[:, :n] @ x + step[:, n:] @ u_now
             now = following
-    if places:
-        error = error @ output[:, None]
     return Move(time, wanted[0], error, force, forward is not None, profile.duration,
                 window, saturated=clipped / count)  # fmt: skip
 
@@ -233,6 +236,7 @@ def on_hardware(
     window: float = 1e-6,
     hardware: Electronics | None = None,
     places: Sequence[BreakPoint] = (),
+    ports: Ports | None = None,
     progress: Callable[[str], None] = lambda words: None,
     options: SimulationOptions = SimulationOptions(),
 ) -> OnHardware:
@@ -252,6 +256,8 @@ def on_hardware(
         None: ideal.
     places : sequence of BreakPoint
         Of several sensors on one actuator: the output of the first moves.
+    ports : Ports or None
+        Where the error counts, if not at the sensors.
     progress : function of str
         Takes lines of progress.
     options : SimulationOptions
@@ -271,7 +277,7 @@ def on_hardware(
     except UserError:
         forward = None
     made = partial(move, plant, delay=delay, profile=profile, window=window, places=places,
-                   options=options)  # fmt: skip
+                   ports=ports, options=options)  # fmt: skip
     progress("a move")
     unlimited = made(free)
     ways = {UNLIMITED[0]: unlimited}

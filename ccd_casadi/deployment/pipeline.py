@@ -348,8 +348,9 @@ def _assessed(
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
     held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
     figures = {at: loop_figures(closed_loop(G, K), places) for at, G in held.items()}
-    at_rest = statics(plants[nominal], K, bandwidth=bandwidth,
-                      omega_low=run.problem.inner.omega_low, places=places)  # fmt: skip
+    loop = run.loop
+    at_rest = statics(loop.plant, K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low,
+                      places=places, ports=loop.ports if loop.ported else None)  # fmt: skip
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
         most = structured_of(run.problem).compliance_max

@@ -117,7 +117,7 @@ def robustness(
 
 
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
-    loop = run.loop_on(run.plant.plant_si())  # as it runs
+    loop = run.loop  # as it runs
     sampled, modal = loop.sampling is not None, run.modal()
     profile = setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
@@ -128,7 +128,7 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
     hz = np.append(view.hz, ends)
 
     def sizes(omega: Array) -> Array:
-        if not loop.at:
+        if not (loop.at or loop.ported):
             return gains(*loop.responses(omega))
         S, found = [sigma_max(one.sensitivity(omega)) for one in loop.places], loop.curves(omega)
         return np.array([np.max(S, 0), *(sigma_max(found[name]) for name in ("T", "GS", "KS"))])
@@ -146,7 +146,12 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         margins=margins(replace(loop, at=()).responses, hz),  # broken at every sensor and input
         noise=noise(loop, d.sensor, d.disturbance),
         statics=statics(
-            loop.plant, loop.controller, bandwidth=omega_b, omega_low=low, places=loop.at
+            loop.plant,
+            loop.controller,
+            bandwidth=omega_b,
+            omega_low=low,
+            places=loop.at,
+            ports=loop.ports if loop.ported else None,
         ),
         shift=shift_line(run, d.shift),
         damping=damping_line(run, *d.damping),
