@@ -298,7 +298,7 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         if not plant.ports:
             return plant
         words = f"compliance and error budget are {plant.between}; the move's error too"
-        return replace(plant, notes=lambda theta: (words,))
+        return replace(plant, notes=lambda theta: (*plant.notes(theta), words))
     return with_fixed(plant, held)
 
 

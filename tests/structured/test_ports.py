@@ -11,12 +11,18 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.codesign.result_entries import move_entry
+from ccd_casadi.codesign.survival import loops_of, survival
+from ccd_casadi.deployment.on_hardware import move
+from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.drive import main as drive
+from ccd_casadi.explore import main as explore
 from ccd_casadi.inner_problem.kinds import design_loops, loop_budget, member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.loop import Loop, tustin
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.robust.margins import noise
+from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.statics import statics
 
@@ -145,6 +151,9 @@ def test_compliance_is_that_of_the_dynamic_stiffness(
     both = f"{options}\nboth = true" if sensors == 2 else options
     problem, K = problem_in(tmp_path, "", both, bandwidth), controller(sensors)
     assert plant_of(problem).ports == ("disturbance", "performance")
+    notes = " ".join(plant_of(problem).notes(problem.start))
+    assert "`disturbance`" in notes
+    assert ("numbers only" in notes) == ("numbers" in options)
     (loop,) = member_loops(problem, problem.start, K)[:1]
     C = np.array([[1.0, 0, 0], [0, 0, 1.0]])[:sensors]
     s = 1j * np.geomspace(0.1, 1e5, 40_000)
@@ -230,14 +239,8 @@ def test_a_sampled_move_and_its_noise_are_the_tools(tmp_path: Path) -> None:
     half = [(profile.at(time + T / 2)[i] - profile.at(time - T / 2)[i]) / T for i in range(4)]
     ahead = np.vstack([r[:1], half]).T @ np.array(found["feedforward"])[:, 0]
     Phi, now, before = held()
-    x, z, last, errors = np.zeros(6), np.zeros(3), 0.0, []
-    for wanted, extra in zip(r[0], ahead, strict=True):
-        e = wanted - x[0]
-        errors.append(abs(wanted - x[1]))
-        u = float((Kz.C @ z + Kz.D @ [e])[0] + extra)
-        z = Kz.A @ z + Kz.B @ [e]
-        x, last = Phi @ x + now[:, 0] * u + before[:, 0] * last, u
-    late = np.flatnonzero(np.array(errors) > found["window"])
+    errors = simulated(Kz, r[0], ahead)
+    late = np.flatnonzero(np.abs(errors) > found["window"])
     assert found["settled"] == pytest.approx(time[late[-1] + 1], abs=1.01 * T)
     n = 6 + 1 + 3  # x, the last u, K's states
     X, enters = np.zeros((n, n)), np.zeros((n, 1))
@@ -247,9 +250,25 @@ def test_a_sampled_move_and_its_noise_are_the_tools(tmp_path: Path) -> None:
     X[:6] += now @ X[6:7]
     enters[:6] += now * enters[6]
     (loop,) = design_loops(problem, problem.start, K)[:1]
+    made = move(loop.plant, realised(Kz), DELAY, profile, ports=loop.ports)
+    own = simulated(Kz, profile.at(made.time)[0], np.zeros(len(made.time)))
+    np.testing.assert_allclose(made.error[:, 0], own, rtol=0, atol=1e-11)  # measured 2e-12
     white = loop_noise(loop)
     P = solve_discrete_lyapunov(X, enters @ enters.T / (2.0 * T))
     assert white == pytest.approx(np.sqrt(P[1, 1]), rel=1e-5)
+
+
+def simulated(K: StateSpace, setpoint: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """The tool's error of a sampled loop, a setpoint and forces beside K's."""
+    Phi, now, before = held()
+    x, z, last, errors = np.zeros(6), np.zeros(3), 0.0, []
+    for wanted, extra in zip(setpoint, ahead, strict=True):
+        e = wanted - x[0]
+        errors.append(wanted - x[1])
+        u = float((K.C @ z + K.D @ [e])[0] + extra)
+        z = K.A @ z + K.B @ [e]
+        x, last = Phi @ x + now[:, 0] * u + before[:, 0] * last, u
+    return np.array(errors)
 
 
 def loop_noise(loop: Loop) -> float:
@@ -284,6 +303,18 @@ def test_what_does_not_know_them_is_named(
         problem_in(tmp_path, "" if "h_inf" in new else SAMPLED, own=(old, new), move=(budget, ""))
 
 
+def test_commands_that_do_not_know_them_say_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem_in(tmp_path, SAMPLED)
+    case = tmp_path / "case.toml"
+    assert explore([str(case), "--no-open"]) == ExitCode.BAD_INPUT
+    assert "not known to explore" in capsys.readouterr().err
+    case.write_text(case.read_text() + '[drive]\nname = "generic"\n')
+    assert drive([str(case)]) == ExitCode.BAD_INPUT
+    assert "not known to [drive]" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -296,3 +327,11 @@ def test_a_wrong_shape_is_named(tmp_path: Path, old: str, new: str, words: str) 
     (tmp_path / "plant.py").write_text(PLANT.replace(old, new))
     with pytest.raises(CaseError, match=words):
         problem_of(load_case(tmp_path / "case.toml"))
+
+
+def test_the_loop_at_rest_in_the_verdict_is_the_tools(tmp_path: Path) -> None:
+    """An integrator holds the carriage; the arm between it and the tool yields by 1/k."""
+    problem, K = problem_in(tmp_path), controller()
+    found = survival(loops_of(problem, problem.start, K), S_max=3.0, bandwidth=100.0, omega_low=HZ)
+    assert np.isinf(found.statics.stiffness)
+    assert found.statics.compliance == pytest.approx(1.0 / 2e5, rel=1e-6)
