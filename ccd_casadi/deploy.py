@@ -75,10 +75,6 @@ def main(options: argparse.Namespace) -> ExitCode:
         remedy = "solve it again, or give --unverified to deploy it nevertheless"
         say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
         return ExitCode.NOT_VERIFIED
-    if kind_of(finished.problem).bounds().places:
-        words = "several sensors on one actuator are not deployed yet"
-        remedy = "controller.json has K(s), which runs by Tustin's rule at loop.rate_hz"
-        raise UserError(f"{options.run}: {words}; {remedy}")
     folder = run_folder(options.run, options.out or options.run / "deploy")
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"
@@ -89,8 +85,11 @@ def main(options: argparse.Namespace) -> ExitCode:
     rate_hz = options.rate_hz or (designed.rate_hz if designed else None)
     if rate_hz is not None:  # else the rate is chosen first
         electronics.require_in_order(1.0 / rate_hz)
-    channels = len(finished.plant.C) if finished.plant.channels else 1
-    reduced = 0 if kind_of(finished.problem).as_designed else channels
+    channels, kind = (
+        len(finished.plant.C) if finished.plant.channels else 1,
+        kind_of(finished.problem),
+    )
+    reduced = 0 if kind.as_designed else channels
     moved, steps = None, reduced + 2 + (options.saturation is not None)
     with Progress(steps, "deploying") as bar:
         found = deploy(
@@ -99,9 +98,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         )  # fmt: skip
         if found.stable:
             moved = on_hardware(
-                finished.plant.plant_si(), found.realisation, found.delay,
+                finished.loop.plant, found.realisation, found.delay,
                 finished.figures.bandwidth, limits=move_limits(options), window=options.window,
-                hardware=electronics,
+                hardware=electronics, places=kind.bounds().places,
+                ports=finished.loop.ports if finished.loop.ported else None,
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
@@ -110,9 +110,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         K, name = found.realisation, run_name(options.run)
-        kind = kind_of(finished.problem).title
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
-                                  "kind": kind}  # fmt: skip
+                                  "kind": kind.title}  # fmt: skip
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
         if structured_text is not None:
             code = structured_text(K, **naming)

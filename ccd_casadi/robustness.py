@@ -34,12 +34,16 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
+    from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.robust.study import robustness, study_dict, survival_line
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
+    if options.axis > 1 and (places := kind_of(finished.problem).bounds().places):
+        words = f"is {options.axis}; of several sensors on one actuator that of {places[0].name}"
+        raise UserError(f"--axis: {words} moves; leave it out")
     if options.axis > outputs:
         raise UserError(f"--axis: is {options.axis}; the plant has outputs 1 to {outputs}")
     if not options.damping[0] <= 1.0 <= options.damping[1]:

@@ -21,9 +21,8 @@ from ccd_casadi.analysis.loop_warnings import (
     second_crossover,
     second_crossover_of,
 )
-from ccd_casadi.lti.break_point import BreakPoint
-from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.loop import Loop, constant_drive
+from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import (
@@ -71,18 +70,20 @@ class LoopFigureOptions:
 @dataclass(frozen=True)
 class ForceStep:
     """The largest displacement by a step of 1 N: `size` in m after `seconds`, of output `output` by
-    actuator `actuator` on plant `plant`, all from 0 on."""
+    actuator `actuator` on plant `plant`, all from 0 on; `names` of what moves and by what."""
 
     size: float
     seconds: float
     output: int
     actuator: int
     plant: int
+    names: tuple[str, str] = ("output", "actuator")
 
     @property
     def pair(self) -> str:
         """Counted from 1, as a reader does."""
-        return f"output {self.output + 1} by actuator {self.actuator + 1}"
+        moved, by = self.names
+        return f"{moved} {self.output + 1} by {by} {self.actuator + 1}"
 
     def entry(self, scalar: bool) -> dict[str, Any]:
         """Of result.json; of several channels with the pair in words."""
@@ -92,15 +93,18 @@ class ForceStep:
 
 def until_rest(
     loop: Loop, longest: float, seconds: float, drives: Array,
-    options: LoopFigureOptions = LoopFigureOptions(),
+    options: LoopFigureOptions = LoopFigureOptions(), *, counted: bool = False,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Times (k,) in s and y (m, p, k) from rest under each of the constant inputs `drives` (n, m),
-    B_r or B_d of the loop over `longest` s; exact at the instants.
+    B_r or B_d of the loop over `longest` s; exact at the instants. `counted`: y is what a force
+    moves.
 
     The first instants follow one another, as the options have it; from there on, to `seconds`, they
     are `coarser` times as far apart, and so on: what is fast has decayed by then.
     """
     steps, count = loop.over_a_step(longest), options.closely
+    if counted:
+        steps = replace(steps, C_y=steps.GS.C)
     n, period, first = len(steps.A), steps.period or longest, 0
     P = np.eye(n + drives.shape[1])
     P[:n, :n], P[:n, n:] = steps.A, drives
@@ -171,7 +175,8 @@ def force_response(
         s and m.
     """
     longest = HZ / bandwidth / options.per_period
-    return until_rest(loop, longest, seconds, loop.over_a_step(longest).B_d, options)
+    drives = loop.over_a_step(longest).B_d
+    return until_rest(loop, longest, seconds, drives, options, counted=True)
 
 
 def largest_force_step(
@@ -198,8 +203,31 @@ def largest_force_step(
         times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
-        found.append(ForceStep(size, float(times[k]), output, actuator, plant))
+        names = ("output" if loop.counted is None else "performance",
+                 "actuator" if loop.drive is None else "disturbance")  # fmt: skip
+        found.append(ForceStep(size, float(times[k]), output, actuator, plant, names))
     return max(found, key=lambda step: step.size)
+
+
+def compliance_of(loops: Sequence[Loop], omega_low: float) -> tuple[float, float, float, float]:
+    """What disturbing forces move, the largest of all loops.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        Closed and stable, SI.
+    omega_low : float
+        The lowest frequency that counts, rad/s.
+
+    Returns
+    -------
+    most, at_rest, low, low_hz : float
+        m/N, over frequency, at rest and at ω_low, and that in Hz.
+    """
+    at, rest = np.array([omega_low]), np.zeros(1)
+    low = max(float(sigma_max(one.moved(at))[0]) for one in loops)
+    held = max(float(sigma_max(one.closed.GS.response(rest))[0]) for one in loops)
+    return max(one.compliance for one in loops), held, low, omega_low / HZ
 
 
 def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
@@ -297,12 +325,9 @@ def gain_margin(margins: ClassicalMargins) -> float:
 
 
 def loop_entry(
-    plants: Sequence[StateSpace],
-    controller: StateSpace,
-    sampling: Sampling | None,
+    loops: Sequence[Loop],
     bandwidth: float,
     sensitivity_peak: float,
-    places: tuple[BreakPoint, ...] = (),
     options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:
     """Margins, steps and warnings of a stable loop under the keys of result.json.
@@ -312,16 +337,10 @@ def loop_entry(
 
     Parameters
     ----------
-    plants : sequence of StateSpace
-        The model first, SI.
-    controller : StateSpace
-        e in, u out, SI.
-    sampling : Sampling or None
-        How the loop runs.
+    loops : sequence of Loop
+        As they run, the model's first, SI; margins are the least of all places of a loop.
     bandwidth, sensitivity_peak : float
         ω_b in rad/s, and ‖S‖∞.
-    places : tuple of BreakPoint
-        Of several sensors on one actuator; margins are the least of all places.
     options : LoopFigureOptions
         Of steps and warnings.
 
@@ -330,7 +349,7 @@ def loop_entry(
     dict
         JSON values.
     """
-    loops = [Loop(plant, controller, sampling, places) for plant in plants]
+    controller = loops[0].controller
     margins = [least_of([least_margins(one.responses, one.grid()) for one in loop.places])
                for loop in loops]  # fmt: skip
     gain = [gain_margin(m) for m in margins]
@@ -351,6 +370,6 @@ def loop_entry(
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
         "force_step_max": force.size,
-        "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1)),
+        "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1) and not loops[0].ported),
         "loop_warnings": warnings,
     }

@@ -200,7 +200,7 @@ def loop_view(
     sizes, opened = np.empty((1 + len(NAMES), len(loops), len(hz))), []
     for i, loop in enumerate(loops):  # of one plant at a time: responses are large
         pair = loop.responses(HZ * hz) if i else (G, K)
-        made = loop.curves(HZ * hz) if loop.at else responses_of(*pair)
+        made = loop.curves(HZ * hz) if loop.at or loop.ported else responses_of(*pair)
         sizes[:, i] = [sigma_max(made[name]) for name in (*NAMES, "GS")]
         if i == 0 or made["S"].shape[1:] == (1, 1):
             opened.append(pair[0] @ pair[1])

@@ -1,7 +1,7 @@
 """Motors that are designed with the plant: the cycle of a move, its forces and heat; their mass."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, ClassVar
@@ -96,12 +96,15 @@ class Motion:
         From its end to the next, s.
     motor : Motor or None
         None: it does not limit.
+    output : tuple of float (p,)
+        Of several sensors on one actuator: uᵀy moves; empty: the first output.
     """
 
     limits: MoveLimits
     window: float
     dwell: float = 0.0
     motor: Motor | None = None
+    output: tuple[float, ...] = field(default=(), repr=False)  # which the controller says, too
 
     @property
     def required(self) -> bool:
@@ -284,12 +287,17 @@ class DrivenMechanics:
         Of the mass among the parameters of θ; None: it is fixed.
     fixed : float
         Then this, kg.
+    inputs : int
+        Of the plant, each with a motor, the first ones.
     """
 
     keep: Any = None  # what CasADi does not keep
 
-    def __init__(self, evaluate: Evaluate, motion: Motion, place: int | None, fixed: float) -> None:
+    def __init__(
+        self, evaluate: Evaluate, motion: Motion, place: int | None, fixed: float, inputs: int
+    ) -> None:
         self.evaluate, self.motion, self.place, self.fixed = evaluate, motion, place, fixed
+        self.inputs = inputs
 
     def own(self, theta: Sequence[float]) -> tuple[float, ...]:
         """θ of the plant alone."""
@@ -301,11 +309,12 @@ class DrivenMechanics:
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         found, m = self.evaluate(self.own(theta)), self.mass(theta)
-        B, (dM, dD, dK, dB, dC) = found.B, found.derivatives
+        B, (dM, dD, dK, dB, dC) = found.B[:, : self.inputs], found.derivatives
         if len(dM):
-            dM = dM + m * (dB @ B.T + B @ dB.transpose(0, 2, 1))
+            own = dB[:, :, : self.inputs]
+            dM = dM + m * (own @ B.T + B @ own.transpose(0, 2, 1))
             if self.place is not None:
-                new = (B @ B.T, *(0.0 * matrix for matrix in (found.D, found.K, B, found.C)))
+                new = (B @ B.T, *(0.0 * matrix for matrix in (found.D, found.K, found.B, found.C)))
                 dM, dD, dK, dB, dC = (
                     np.insert(slope, self.place, more, axis=0)
                     for slope, more in zip((dM, dD, dK, dB, dC), new, strict=True)
@@ -314,13 +323,21 @@ class DrivenMechanics:
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
         """The move at θ. Raises UserError where a spring holds the output."""
-        free = without_hidden_rigid_modes(modal_plant(self(theta), FREE))
+        found, row = self(theta), np.array([self.motion.output])
+        if self.motion.output:
+            own = (*found.derivatives[:4], row @ found.derivatives[4])
+            found = replace(found, C=row @ found.C, derivatives=own)
+        free = without_hidden_rigid_modes(modal_plant(found, FREE))
         bare = scale_plant(free, 1.0, bare=True)
         return motion_at(self.motion, bare, self.mass(theta), self.place, sampling)
 
 
 def with_motion(
-    plant: Plant, motion: Motion, names: Sequence[str], held: Mapping[str, float]
+    plant: Plant,
+    motion: Motion,
+    names: Sequence[str],
+    held: Mapping[str, float],
+    inputs: int | None = None,
 ) -> Plant:
     """A plant with the mass, the power and the peak force of its motors.
 
@@ -334,6 +351,8 @@ def with_motion(
         Of θ: the plant's own parameters and the motor's size where that is one.
     held : mapping
         Fixed parameters by name, SI; the motor's size may be among them.
+    inputs : int, optional
+        The first ones of the plant, which have motors; left out, all.
 
     Returns
     -------
@@ -346,7 +365,7 @@ def with_motion(
     fixed = 0.0 if motor is None else held.get(size, motor.moving_mass[0])
 
     def of(evaluate: Evaluate) -> DrivenMechanics:
-        return DrivenMechanics(evaluate, motion, place, fixed)
+        return DrivenMechanics(evaluate, motion, place, fixed, inputs or plant.inputs)
 
     own, domain = of(plant.evaluate), plant.domain
     if domain is not None and motor is not None and place is not None:

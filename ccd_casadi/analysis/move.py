@@ -8,7 +8,10 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array, states
 
@@ -147,7 +150,9 @@ class Move:
         return np.sqrt(np.tensordot(spans / spans.sum(), signal[where] ** 2, 1))
 
 
-def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
+def mass_feedforward(
+    modal: ModalPlant, axis: int, places: Sequence[BreakPoint] = ()
+) -> Array | None:
     """Forces that accelerate one output alone, by the rigid bodies.
 
     Parameters
@@ -156,6 +161,8 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
         SI.
     axis : int
         The output, from 0.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: the output is that whose error counts.
 
     Returns
     -------
@@ -163,6 +170,8 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
         N per unit acceleration; None where no rigid body moves it so.
     """
     R = modal.C[:, modal.rigid] @ modal.B[modal.rigid]
+    if places:
+        R, axis = np.array([places[0].output]) @ R, 0
     wanted = np.eye(len(R))[axis]
     forces = np.linalg.pinv(R) @ wanted if R.size else np.zeros(modal.B.shape[1])
     return forces if np.allclose(R @ forces, wanted, rtol=0.0, atol=1e-6) else None
@@ -212,6 +221,8 @@ def simulate(
 ) -> Move:  # fmt: skip
     """Simulate the move of one output, the others with a setpoint of 0, until it has settled.
 
+    Several sensors on one actuator have references as of `course`.
+
     Parameters
     ----------
     loop : Loop
@@ -237,38 +248,45 @@ def simulate(
     ahead = np.zeros((5, loop.plant.B.shape[1]))
     if forces is not None:
         ahead[2 if forces.ndim == 1 else slice(None)] = forces
-    closed, tail = loop.closed, options.tail / bandwidth_hz
+    output, reference = course(loop.plant, axis, loop.at)
+    closed, tail = closed_loop(*loop.as_run), options.tail / bandwidth_hz
+    rows, wanted = (output @ closed.C_y)[None], np.ones(1)
+    if loop.counted is not None:
+        rows = np.zeros((len(loop.counted), len(closed.A)))
+        rows[:, : len(loop.plant.A)] = loop.counted
+        wanted = loop.ports.wanted[:, 0 if loop.at else axis]
     ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz
     step = loop.period or float(np.clip(profile.duration / options.steps_per_move, *ends))
-    A, drive = _over(loop, ahead, axis, step)
+    A, drive = _over(loop, ahead, reference, step)
     for _ in range(options.doublings):
         time = np.arange(np.ceil((profile.duration + tail) / step) + 1) * step
         r = profile.at(time) if loop.period is None else held_setpoint(profile, time, step)
         driven = r.T @ drive.T
         if loop.period is None:
-            _switch(driven, loop, ahead, axis, profile, step)
+            _switch(driven, loop, ahead, reference, profile, step)
         x = states(A, driven)
-        error = r[0] - x @ closed.C_y[axis]
+        error = np.outer(r[0], wanted) - x @ rows.T
         if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
             break
         tail *= 2.0
-    force = x @ closed.C_u.T + np.outer(r[0], closed.D_u[:, axis]) + r.T @ ahead
+    force = x @ closed.C_u.T + np.outer(r[0], closed.D_u @ reference) + r.T @ ahead
     end = r[0, -1]  # whose derivatives are zero
-    rest = end - end * closed.C_y[axis] @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
+    rest = end * wanted - end * rows @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
+    error = error[:, 0] if len(wanted) == 1 else error
     return Move(time, r[0], error, force, forces is not None,
-                profile.duration, window, rest=abs(float(rest)))  # fmt: skip
+                profile.duration, window, rest=float(np.abs(rest).max()))  # fmt: skip
 
 
-def _over(loop: Loop, ahead: Array, axis: int, step: float) -> tuple[Array, Array]:
+def _over(loop: Loop, ahead: Array, reference: Array, step: float) -> tuple[Array, Array]:
     """What states, and the setpoint with its derivatives (n, 5), do to the states in a step (s).
 
     A continuous loop and the four integrators of its setpoint are one linear system.
     """
-    closed, n = loop.closed, len(loop.closed.A)
-    G = loop.as_run[0]
+    closed, G = closed_loop(*loop.as_run), loop.as_run[0]
+    n = len(closed.A)
     drive = np.zeros((n, 5))
     drive[: len(G.A)] = G.B @ ahead.T
-    drive[:, 0] += closed.B_r[:, axis]
+    drive[:, 0] += closed.B_r @ reference
     if loop.sampling is not None:
         return closed.A, drive
     whole = np.zeros((n + 5, n + 5))
@@ -278,7 +296,7 @@ def _over(loop: Loop, ahead: Array, axis: int, step: float) -> tuple[Array, Arra
 
 
 def _switch(
-    driven: Array, loop: Loop, ahead: Array, axis: int, profile: Setpoint, step: float
+    driven: Array, loop: Loop, ahead: Array, reference: Array, profile: Setpoint, step: float
 ) -> None:
     """Put right what drives a continuous loop in the steps within which snap jumps."""
     ends = np.cumsum(profile.durations)
@@ -286,7 +304,7 @@ def _switch(
         inside = ends[(k * step < ends) & (ends < (k + 1) * step)]
         driven[k] = 0.0
         for start, end in pairwise([k * step, *inside, (k + 1) * step]):
-            A, drive = _over(loop, ahead, axis, end - start)
+            A, drive = _over(loop, ahead, reference, end - start)
             driven[k] = A @ driven[k] + drive @ profile.at(np.array([start]))[:, 0]
 
 

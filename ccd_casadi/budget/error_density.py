@@ -12,7 +12,7 @@ with much to spare, is what is reported (Piessens et al. 1983, QUADPACK).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from ccd_casadi.budget.noise_process import FORCES, process
 from ccd_casadi.budget.sources import ErrorSource, SourceKind
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import sensitivity
+from ccd_casadi.lti.ports import Ports
+from ccd_casadi.lti.state_space import sensitivity, strictly_proper
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 
@@ -142,24 +143,33 @@ class PanelOptions:
 
 @dataclass(frozen=True)
 class Responses:
-    """G and K as in the loop, the disturbed G, S = (1 + GK)⁻¹ and (1 + KG)⁻¹, (k, ·, ·)."""
+    """G and K as in the loop, S = (1 + GK)⁻¹, S G of the disturbed G, and of what counts but no
+    sensor sees the parts of u and of d, (k, ·, ·)."""
 
     G: np.ndarray
     K: np.ndarray
     free: np.ndarray
     S: np.ndarray
+    moved: np.ndarray
+    ports: Ports
+    beyond: tuple[np.ndarray, np.ndarray] | None = None
 
     def seen(self, kind: SourceKind) -> np.ndarray:
         """What of a source the controller reads."""
         if kind in FORCES:
-            return -self.S @ self.free
-        return self.S if kind is SourceKind.SETPOINT else -self.S
+            return -self.moved
+        return self.S @ self.ports.reference if kind is SourceKind.SETPOINT else -self.S
 
     def of(self, kind: SourceKind) -> tuple[np.ndarray, np.ndarray]:
         """H_e and H_u of a source."""
         seen = self.seen(kind)
+        force = self.K @ seen
         true = np.eye(seen.shape[1]) + seen if kind is SourceKind.SENSOR_NOISE else seen
-        return true, self.K @ seen
+        true = self.ports.wanted @ self.ports.rows @ true
+        if self.beyond is not None:
+            of_u, of_d = self.beyond
+            true = true - of_u @ force - (of_d if kind in FORCES else 0.0)
+        return true, force
 
 
 def responses(loop: Loop, hz: Array) -> Responses:
@@ -177,8 +187,22 @@ def responses(loop: Loop, hz: Array) -> Responses:
     """
     omega = HZ * np.asarray(hz, float)
     G, K = (part.response(omega) for part in loop.as_run)
-    free = G if loop.sampling is None else loop.plant.response(omega)
-    return Responses(G, K, free, sensitivity(G @ K))
+    plant, ports = loop.plant, loop.ports
+    disturbed = strictly_proper(plant.A, ports.drive, plant.C)
+    free = disturbed.response(omega) if loop.sampling or loop.drive is not None else G
+    if G.shape[1] == G.shape[2]:
+        S = sensitivity(G @ K)
+        moved = S @ free
+    else:  # of more sensors G K is a product of low rank, and 1 + G K singular to rounding
+        inner = np.linalg.inv(np.eye(G.shape[2]) + K @ G)
+        S = np.eye(G.shape[1]) - G @ inner @ K
+        moved = G @ inner if free is G else free - G @ inner @ K @ free
+    found = Responses(G, K, free, S, moved, ports)
+    if ports.beyond is None:
+        return found
+    of_u, of_d = (strictly_proper(plant.A, B, ports.beyond) for B in (loop.plant.B, ports.drive))
+    run = replace(loop, plant=of_u).as_run[0]
+    return replace(found, beyond=(run.response(omega), of_d.response(omega)))
 
 
 def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag, expm, matrix_balance
 
 from ccd_casadi.budget.sources import ErrorSource, SourceKind
 from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, delayed
+from ccd_casadi.lti.ports import Ports
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -47,6 +48,7 @@ def average_matrix(A: Array, window: float, period: float | None) -> Array:
 
 
 FORCES = (SourceKind.FORCE, SourceKind.FLOOR_MOTION)
+Rows = tuple[tuple[float, ...], ...]
 Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis
 
 
@@ -111,19 +113,23 @@ class Process:
 
 
 def disturbed(
-    G: StateSpace, sources: Sequence[ErrorSource], hold: Sampling | None, order: int
-) -> Process:
+    G: StateSpace, sources: Sequence[ErrorSource], hold: Sampling | None, order: int,
+    ports: Ports | None = None,
+) -> Process:  # fmt: skip
     """A plant without feedthrough (SI) under independent sources of white noise through filters,
-    with the states of a controller of this order that does nothing yet.
+    with the states of a controller of this order that does nothing yet. `ports`: those of G where
+    forces do not act, or the error does not count, at its own inputs and outputs.
 
     Raises ValueError for a tabulated source, which has no state space.
     """
     (p, n), m, T = G.C.shape, G.B.shape[1], 0.0 if hold is None else hold.period
-    force, _ = _joined(tuple(one for one in sources if one.kind in FORCES), m)
-    f, true = _joined(tuple(one for one in sources if one.kind not in FORCES), p)
-    drive, driven = np.vstack([G.B @ force.D, force.B]), n + len(force.A)
+    own = ports or Ports(G.B, G.C, np.eye(p), np.eye(p), np.eye(p))
+    force, _ = _joined(tuple(one for one in sources if one.kind in FORCES), own.drive.shape[1])
+    rows = [tuple(map(tuple, part.tolist())) for part in (own.reference, own.wanted) if ports]
+    f, true = _joined(tuple(one for one in sources if one.kind not in FORCES), p, *rows)
+    drive, driven = np.vstack([own.drive @ force.D, force.B]), n + len(force.A)
     G = StateSpace(
-        np.block([[G.A, G.B @ force.C], [np.zeros((driven - n, n)), force.A]]),
+        np.block([[G.A, own.drive @ force.C], [np.zeros((driven - n, n)), force.A]]),
         np.vstack([G.B, np.zeros((driven - n, m))]),
         np.hstack([G.C, np.zeros((p, driven - n))]),
         G.D,
@@ -145,24 +151,34 @@ def disturbed(
     L[:held, :m], L[held:first, m:] = G.B, np.eye(order)
     R[:p, :held], R[:p, first:], R[p:, held:first] = -G.C, f.C, np.eye(order)
     W[:p, q:] = f.D / np.sqrt(2.0 * (T or 1.0))  # of samples: the density times half the rate
-    C = np.hstack([R[:p, :first], true])
+    counted = np.zeros((len(own.counted), first), kind)
+    counted[:, :n] = -own.counted
+    C = np.hstack([counted, true])
     return Process(
         A, Q, C, np.zeros((m, count)), E, np.zeros((m, len(W.T))), L, R, W, hold is not None
     )
 
 
 @lru_cache(64)  # every plant of a set has the same
-def _joined(sources: tuple[ErrorSource, ...], channels: int) -> tuple[StateSpace, Matrix]:
+def _joined(
+    sources: tuple[ErrorSource, ...], channels: int, reference: Rows = (), wanted: Rows = ()
+) -> tuple[StateSpace, Matrix]:
     """The filters side by side, each in every channel, with their sum as the controller reads it;
-    and C of what of it is true."""
+    and C of what of it is true. A setpoint enters by `reference` and requires `wanted`."""
+    one_each = np.eye(channels)
+    R, W = (np.array(rows) if rows else one_each for rows in (reference, wanted))
     none, out = np.zeros((0, 0)), np.zeros((channels, 0))
-    parts: list[list[Matrix]] = [[none], [none], [out], [out], [out]]
+    parts: list[list[Matrix]] = [[none], [none], [out], [out], [np.zeros((len(W), 0))]]
     for one in sources:
         if not one.shaped:
             raise ValueError("a tabulated source has no state space")
         own, sign = one.shaping(), -1.0 if one.kind is SourceKind.SENSOR_NOISE else 1.0
-        A, B, C, D = (np.kron(np.eye(channels), part) for part in (own.A, own.B, own.C, own.D))
-        added = (A, B, sign * C, sign * D, C * (one.kind is SourceKind.SETPOINT))
+        setpoint = one.kind is SourceKind.SETPOINT
+        enters = R if setpoint else one_each
+        A, B = (np.kron(np.eye(enters.shape[1]), part) for part in (own.A, own.B))
+        C, D = (sign * np.kron(enters, part) for part in (own.C, own.D))
+        true = np.kron(W, own.C) if setpoint else np.zeros((len(W), len(A)))
+        added = (A, B, C, D, true)
         for part, own_part in zip(parts, added, strict=True):
             part.append(own_part)
     A, B = (block_diag(*part) for part in parts[:2])
@@ -208,7 +224,7 @@ def process(loop: Loop, source: ErrorSource) -> Process:
     if K.period:
         K, T = replace(K, A=K.A - np.eye(len(K.A))), None
     M = run_matrix((K.A, K.B, K.C, K.D), T)
-    return disturbed(loop.plant, (source,), loop.sampling, len(K.A)).closed(M)
+    return disturbed(loop.plant, (source,), loop.sampling, len(K.A), loop.ports).closed(M)
 
 
 def _held(G: StateSpace, hold: Sampling) -> StateSpace:

@@ -13,11 +13,17 @@ from ccd_casadi.cases.controller_tables import filters_of, motion_problem
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
 from ccd_casadi.cases.tables import Case, RobustTable
-from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
+from ccd_casadi.inner_problem.controller_problem import (
+    BANDWIDTH,
+    MixedSensitivityProblem,
+    Options,
+    RobustSet,
+)
 from ccd_casadi.inner_problem.plant_source import PlantSource
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, refuse_ports, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import require_motion
-from ccd_casadi.inner_problem.structured_plant_set import with_options
+from ccd_casadi.inner_problem.structured_plant_set import break_points_of, with_options
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.lti.wiring import Wiring
 from ccd_casadi.plants.modal import Suspension
@@ -119,7 +125,11 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         problem.controller.require_plants(plants)
         if math.isnan(problem.weights.M_K):
             problem = _with_a_scale(problem)
-        if problem.source.motion is not None:
+        _require_ports_known(problem)
+        if (motion := problem.source.motion) is not None:
+            if places := break_points_of(problem):  # the one whose error counts moves
+                motion = replace(motion, output=places[0].output)
+                problem = replace(problem, source=replace(problem.source, motion=motion))
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
@@ -137,6 +147,21 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         words = f"{function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _require_ports_known(problem: CoDesignProblem) -> None:
+    """Raise PlantError where a plant with a disturbance or a performance meets what knows none."""
+    own, source = problem.controller, problem.source
+    sections = own if isinstance(own, StructuredProblem) else None
+    if sections is None:
+        refuse_ports(problem, 'full order, but to controller.structure = "sections" alone')
+    elif sections.compliance_max is not None:
+        refuse_ports(problem, "inner.compliance_max, which bounds the actuators' at the sensors")
+    elif sections.figure is not BANDWIDTH:
+        refuse_ports(problem, f'inner.minimise = "{sections.minimise}"')
+    for given, name in ((source.wiring, "[actuator] and [sensor]"), (source.places, "[places]")):
+        if given:
+            refuse_ports(problem, name)
 
 
 def _suspension(case: Case) -> Suspension:

@@ -6,7 +6,7 @@ from typing import Any
 
 from ccd_casadi.budget import SourceKind
 from ccd_casadi.cases.checks import Fail
-from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable, MoveTable
+from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
 from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES, RMS_ERROR, Options
@@ -153,15 +153,10 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
 
 def _check_sensors(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where several sensors on one actuator cannot be designed as the case says."""
-    controller, inner, budget = tables["controller"], tables["inner"], tables["budget"]
+    controller, inner = tables["controller"], tables["inner"]
     if inner.minimise != BANDWIDTH.key:
         words = "with several sensors on one actuator the bandwidth alone is known; drop it"
         raise fail("inner.minimise", words)
-    sources = any(getattr(budget, kind.value) for kind in SourceKind)
-    for name, given in (("move", tables["move"] != MoveTable()), ("budget", sources)):
-        if given:
-            words = "is not known with several sensors on one actuator; drop it, or bandwidth_of"
-            raise fail(name, words)
     for name, own in controller.channel:
         where = f"controller.channel.{name}"
         if own.integrator and name != controller.bandwidth_of:

@@ -15,13 +15,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
-from ccd_casadi.inner_problem.kinds import loop_on
+from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.objective import final_design
-from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    free_modal,
+    plant_of,
+    scaled_plant,
+    with_ports,
+)
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
@@ -31,7 +38,7 @@ from ccd_casadi.inner_problem.structured_problem import ChannelProblem, Structur
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
 from ccd_casadi.lti.loop import Loop, Sampling
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -120,10 +127,16 @@ class FinishedRun(NotebookHtml):
         found = loop_on(self.problem, plant, self.controller)
         return found if self.sampling is None else replace(found, sampling=self.sampling)
 
+    @property
+    def loop(self) -> Loop:
+        """The loop on the model, as it runs, with its ports."""
+        wide = with_ports(self.problem)
+        plant = self.plant if wide is self.problem else scaled_plant(wide, self.theta)
+        return self.loop_on(plant.plant_si())
+
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""
-        low = self.problem.inner.omega_low
-        return measure(plant, controller, self.weights, omega_low=low)
+        return _measured(self.problem, plant, controller, self.weights)
 
     def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
         """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
@@ -135,6 +148,24 @@ class FinishedRun(NotebookHtml):
 
         plant, controller = named_plant(self.plant.plant_si()), named_controller(self.controller)
         return to_control(plant, "plant"), to_control(controller, "controller")
+
+
+def _measured(
+    problem: CoDesignProblem, plant: ScaledPlant, controller: StateSpace, weights: Weights
+) -> DesignFigures:
+    """Of several sensors on one actuator as `loop_figures`, S_low where the error counts."""
+    low = problem.inner.omega_low
+    found, places = (
+        measure(plant, controller, weights, omega_low=low),
+        kind_of(problem).bounds().places,
+    )
+    if not places:
+        return found
+    whole = closed_loop(plant.plant_si(), controller)
+    own, at_low = loop_figures(whole, places), places[0].closed(whole).S.response(np.array([low]))
+    return replace(found, sensitivity_low=float(abs(at_low[0, 0, 0])), bandwidth=own.bandwidth,
+                   sensitivity_peak=own.sensitivity_peak,
+                   sensitivity_peak_frequency=own.sensitivity_peak_frequency)  # fmt: skip
 
 
 def read_run(folder: str | Path, *, options: RunFolderOptions = RunFolderOptions()) -> FinishedRun:
@@ -272,10 +303,7 @@ def _read_structured(
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
     problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa)
-    figures = measure(
-        scaled_plant(problem, theta), controller, problem.weights,
-        omega_low=problem.inner.omega_low,
-    )  # fmt: skip
+    figures = _measured(problem, scaled_plant(problem, theta), controller, problem.weights)
     return {"problem": problem, "weights": problem.weights, "controller": controller,
             "figures": figures, "kappa": kappa}  # fmt: skip
 

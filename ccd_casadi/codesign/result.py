@@ -31,7 +31,6 @@ from ccd_casadi.codesign.verdict import (
     predicted,
 )
 from ccd_casadi.codesign.verified import Solution, Verified
-from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.support.arrays import Array
@@ -70,9 +69,7 @@ def result_dict(
         "optimal": optimality(gap=verified.inner_gap),
         "predicted": predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
         "survives": verified.survives_line(),
-        "deployable": deployable(
-            verified.survival, problem.sampling, not kind_of(problem).bounds().places
-        ),
+        "deployable": deployable(verified.survival, problem.sampling),
     }
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}

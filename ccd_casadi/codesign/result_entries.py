@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.analysis.loop_figures import compliance_of, loop_entry
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
@@ -17,12 +17,13 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
+from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
@@ -87,7 +88,11 @@ def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design)
                    omega_low=problem.inner.omega_low)  # fmt: skip
     return (
         found
-        | loop_entry(plants, design.controller, None, figures.bandwidth, figures.sensitivity_peak)
+        | loop_entry(
+            [Loop(one, design.controller) for one in plants],
+            figures.bandwidth,
+            figures.sensitivity_peak,
+        )
         | compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
     )
 
@@ -117,7 +122,7 @@ def move_entry(
     if problem.source.motion is None:
         return {}
     motion = motion_of(problem, theta)
-    made = exact_moves(problem, motion, kind_of(problem).plants(theta), controller)
+    made = exact_moves(motion, design_loops(problem, theta, controller))
     cycle, own = motion.cycle, problem.source.motion
     times = np.maximum([move.settled for move in made], cycle.profile.duration)
     ahead = motion.forward_force(problem.sampling)
@@ -210,14 +215,16 @@ def design_dict(
     sampling, loop = problem.sampling, dict[str, Any]()
     if all(plant.stable for plant in judged.plants):  # else there are no margins and steps
         assert design.controller is not None
-        plants = [plant.plant_si() for plant in plants_of(problem, theta)]
-        bounds = bounds_of(problem)
-        loop = loop_entry(plants, design.controller, sampling, design.bandwidth, highest.S_peak,
-                          bounds.places)  # fmt: skip
+        loops = design_loops(problem, theta, design.controller)
+        loop = loop_entry(loops, design.bandwidth, highest.S_peak)
     grown = max(plant.stability for plant in judged.plants)
     if sampling is not None:  # of the spectral radius: the real part that it comes from
         grown = float(np.log1p(grown)) / sampling.period
-    ratios = judged.worst
+    ratios, ported = judged.worst, {}
+    if loop and loops[0].ported:
+        ported = compliance_dict(*compliance_of(loops, problem.inner.omega_low))
+        between = plant_of(problem).between
+        ported["compliance_words"] += f", {between}"
     return {
         **dict.fromkeys(("omega_S_hz", "omega_T_hz")),
         "outcome": design.outcome.name.lower(),
@@ -233,6 +240,7 @@ def design_dict(
             max(plant.low_compliance for plant in judged.plants),
             problem.inner.omega_low / HZ,
         ),
+        **ported,  # of other forces, and of what counts
         "KS_max": max(plant.KS for plant in judged.plants),
         **loop,
         **_channel_entry(bounds_of(problem), judged),

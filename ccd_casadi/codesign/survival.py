@@ -8,7 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
-from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
+from ccd_casadi.inner_problem.kinds import MixedSensitivity, design_loops, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import Loop, Sampling, tustin
@@ -68,6 +68,8 @@ class LoopsOffModel:
         Whether the plant's damping is a matrix, not ratios.
     places : tuple of BreakPoint
         Of several sensors on one actuator.
+    ported : Loop or None
+        That on the model where forces act, or the error counts, elsewhere.
     options : SurvivalOptions
         Numbers of the ranges.
     known : dict
@@ -82,6 +84,7 @@ class LoopsOffModel:
     grows: Array
     given: bool
     places: tuple[BreakPoint, ...] = ()
+    ported: Loop | None = None
     options: SurvivalOptions = SurvivalOptions()
     known: dict[Perturbation, Loop] = field(default_factory=dict, compare=False)
 
@@ -236,7 +239,10 @@ def loops_of(
     """
     system = mechanics(plant_of(problem), theta)
     places = kind_of(problem).bounds().places
-    return loops_off_model(system, controller, problem.sampling, problem.suspension.free, places)
+    found = loops_off_model(system, controller, problem.sampling, problem.suspension.free, places)
+    if not plant_of(problem).ports:
+        return found
+    return replace(found, ported=design_loops(problem, theta, controller)[0])
 
 
 def growth_of(loop: Loop) -> float:
@@ -399,6 +405,7 @@ def survival(
     `marks`: shifts that are evaluated too, on both sides.
     """
     nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
+    own = loops.ported or nominal
     denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
     if nominal.stable and not nominal.peak <= level:
         denied = f"a second engine finds a peak of S of {nominal.peak:.6g} on the model itself"
@@ -419,7 +426,14 @@ def survival(
         delay=margins.delay,
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
-        statics=statics(nominal.plant, loops.controller, bandwidth=bandwidth, omega_low=omega_low),
+        statics=statics(
+            own.plant,
+            loops.controller,
+            bandwidth=bandwidth,
+            omega_low=omega_low,
+            places=loops.places,
+            ports=own.ports if own.ported else None,
+        ),
         contradiction=denied,
         S_max_slack=exceeded,
     )

@@ -353,17 +353,11 @@ def survives(
     return VerdictLine(state, "; ".join(said), figures)
 
 
-def deployable(
-    survival: Survival | None, sampling: Sampling | None = None, coded: bool = True
-) -> VerdictLine:
-    """Before `deploy`: whether it is designed as it runs, or what delay its margins leave; `coded`:
-    whether `deploy` writes such a controller."""
+def deployable(survival: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
+    """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
     figures: dict[str, float] = {}
     if survival is not None:
         figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
-    if not coded:
-        words = "several sensors on one actuator are not deployed yet; controller.json has K(s)"
-        return VerdictLine(State.UNKNOWN, words, figures)
     if sampling is not None and survival is not None and not survival.contradiction:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "

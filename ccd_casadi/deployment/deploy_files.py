@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.text import HZ, versions
 from ccd_casadi.synthesis.interchange import DesignFile, named_controller, named_plant, write_mat

@@ -8,13 +8,14 @@ from itertools import pairwise
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import SampledFigures, loop_figures, worst_figures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.realisation import LoopChannel
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
-from ccd_casadi.robust.perturbed import SampledFigures, sampled_figures, worst_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
@@ -91,11 +92,12 @@ class Target:
 
 
 def loop_at(
-    plant: StateSpace, controller: StateSpace, conversion: Conversion, period: float, delay: float
-) -> SampledFigures:
-    """The figures of the sampled loop."""
+    plant: StateSpace, controller: StateSpace, conversion: Conversion, period: float, delay: float,
+    places: Sequence[BreakPoint] = (),
+) -> SampledFigures:  # fmt: skip
+    """The figures of the sampled loop; of several sensors on one actuator at these `places`."""
     K = discretise(controller, conversion, period, delay)
-    return sampled_figures(closed_loop(sampled(plant, period, delay), K).S)
+    return loop_figures(closed_loop(sampled(plant, period, delay), K), places)
 
 
 def needed_rate(
@@ -153,7 +155,7 @@ def loops_meet(
     def at(member: Member | None = None) -> SampledFigures:
         return worst_figures([
             loop_at((c.plant if member is None else member.seen_by(c)).plant_si(), K, conversion,
-                    1.0 / rate, delay)
+                    1.0 / rate, delay, c.places)
             for c, K in loops
         ])  # fmt: skip
 

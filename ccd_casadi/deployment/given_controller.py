@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.budget.sources import polynomial
 from ccd_casadi.cases.case import read_toml
 from ccd_casadi.cases.checks import POSITIVE, Fail, require_good, tables
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.lti.loop import Sampling, tustin
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.perturbed import sampled_figures
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.interchange import read_mat
@@ -98,7 +98,8 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
 
 def _measured(run: FinishedRun) -> FinishedRun:
     """The run with ω_b and ‖S‖∞ of its sampled loop; NaN where that is unstable."""
-    f = sampled_figures(run.loop_on(run.plant.plant_si()).closed.S)
+    loop = run.loop_on(run.plant.plant_si())
+    f = loop_figures(closed_loop(*loop.as_run), loop.at)
     figures = replace(run.figures, bandwidth=f.bandwidth, sensitivity_peak=f.sensitivity_peak)
     return replace(run, figures=figures)
 

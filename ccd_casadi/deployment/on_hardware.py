@@ -1,6 +1,6 @@
 """The deployed controller on the machine: sampled, delayed, saturated, quantised moves."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -13,7 +13,9 @@ from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import DelayOptions
+from ccd_casadi.lti.ports import Ports, course
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -95,21 +97,26 @@ def move(
     profile: Setpoint,
     *,
     axis: int = 0,
+    places: Sequence[BreakPoint] = (),
+    ports: Ports | None = None,
     forward: Array | None = None,
     window: float = 1e-6,
     hardware: Electronics | None = None,
     options: SimulationOptions = SimulationOptions(),
 ) -> Move:
-    """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None."""
+    """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None. Of several
+    sensors on one actuator that of the first place, with references as of `course`. The error is
+    that of the `ports`, where they count something else."""
     hardware = hardware or Electronics()
     K, T = realisation.system, realisation.system.period
-    n, m, p = len(plant.A), len(K.C), len(plant.C)
+    n, m = len(plant.A), len(K.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
-    wanted = profile.at(time)
+    wanted, (output, reference) = profile.at(time), course(plant, axis, places)
     ahead = np.zeros((count, m))
     if forward is not None:
-        ahead = np.einsum("kt,km->tm", wanted, forward[:, :, axis])
+        own = forward @ reference if places else forward[:, :, axis]
+        ahead = np.einsum("kt,km->tm", wanted, own)
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
@@ -122,14 +129,16 @@ def move(
         return np.asarray(expm(joint * (T * share))[:n])
 
     x, z, u_now = np.zeros(n), np.zeros(len(K.A)), np.zeros(m)
-    error, force = np.zeros((count, p)), np.zeros((count, m))
+    rows, aim = (output[None] @ plant.C, np.ones(1)) if places else (plant.C, reference)
+    if ports is not None:
+        rows, aim = ports.counted, ports.wanted[:, 0 if places else axis]
+    error, force = np.zeros((count, len(aim))), np.zeros((count, m))
     limit, gain = realisation.saturation, realisation.back_calculation
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
-        r = np.zeros(p)
-        r[axis] = wanted[0, k]
-        error[k] = r - y
+        r = reference * wanted[0, k]
+        error[k] = aim * wanted[0, k] - rows @ x
         e = r - _stepped(y, hardware.sensor_step)
         v = K.C @ z + K.D @ e + ahead[k]
         u = v if limit is None else np.clip(v, -limit, limit)
@@ -149,6 +158,17 @@ def move(
             now = following
     return Move(time, wanted[0], error, force, forward is not None, profile.duration,
                 window, saturated=clipped / count)  # fmt: skip
+
+
+def forward_of(
+    plant: StateSpace, period: float, delay: float, places: Sequence[BreakPoint]
+) -> Array:
+    """`feedforward`; of several sensors on one actuator of the output that counts, in the column of
+    each sensor its share in that."""
+    if not places:
+        return feedforward(plant, period, delay)
+    row = np.array([places[0].output])
+    return feedforward(replace(plant, C=row @ plant.C, D=row @ plant.D), period, delay) * row
 
 
 def _stepped(value: Array, step: float) -> Array:
@@ -215,6 +235,8 @@ def on_hardware(
     limits: MoveLimits,
     window: float = 1e-6,
     hardware: Electronics | None = None,
+    places: Sequence[BreakPoint] = (),
+    ports: Ports | None = None,
     progress: Callable[[str], None] = lambda words: None,
     options: SimulationOptions = SimulationOptions(),
 ) -> OnHardware:
@@ -232,6 +254,10 @@ def on_hardware(
         Of the setpoint, and where the move has to end, m.
     hardware : Electronics or None
         None: ideal.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: the output of the first moves.
+    ports : Ports or None
+        Where the error counts, if not at the sensors.
     progress : function of str
         Takes lines of progress.
     options : SimulationOptions
@@ -247,10 +273,11 @@ def on_hardware(
         hardware.require_in_order(K.period)
     free = replace(realisation, saturation=None, back_calculation=None)
     try:
-        forward = feedforward(plant, K.period, delay)
+        forward = forward_of(plant, K.period, delay, places)
     except UserError:
         forward = None
-    made = partial(move, plant, delay=delay, profile=profile, window=window, options=options)
+    made = partial(move, plant, delay=delay, profile=profile, window=window, places=places,
+                   ports=ports, options=options)  # fmt: skip
     progress("a move")
     unlimited = made(free)
     ways = {UNLIMITED[0]: unlimited}

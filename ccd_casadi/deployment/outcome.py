@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
+from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deployment.discretise import Conversion, Target
@@ -20,7 +21,6 @@ from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, spoken
 from ccd_casadi.synthesis.statics import Statics

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.discretise import (
     Conversion,
@@ -45,7 +46,7 @@ from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
+from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.support.worker_process import one_blas_thread
@@ -99,7 +100,14 @@ def at_its_rate(
     """
     tustin, rate = Conversion.TUSTIN, timing.rate_hz or designed.rate_hz
     plant = run.plant.plant_si()
-    own = loop_at(plant, run.controller, tustin, designed.period, designed.delay)
+    own = loop_at(
+        plant,
+        run.controller,
+        tustin,
+        designed.period,
+        designed.delay,
+        kind_of(run.problem).bounds().places,
+    )
     excess, tolerance = options.designed_excess, options.sampled_bandwidth
     target = Target(run.problem.inner.S_max, excess, own.bandwidth, tolerance)
     if timing.delay is None and timing.delay_samples == Timing.delay_samples:
@@ -115,7 +123,8 @@ def at_its_rate(
 def require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timing) -> None:
     """Raise UserError where single channels have bounds that a loop other than that designed may
     pass: figures of sampled loops here are of the whole."""
-    if not any(own.given for own in bounds_of(run.problem).channels):
+    bounds = bounds_of(run.problem)
+    if not any(own.given and own.S_max != bounds.S_max for own in bounds.channels):
         return
     words = f"{run.folder}: channels have bounds of their own, which are judged as designed alone"
     if designed is None:
@@ -127,7 +136,8 @@ def require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timi
 
 
 def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
-    """The sections of every channel as they are; figures of each on its own entry of the plant."""
+    """The sections of every channel as they are; figures of each on its own entry of the plant, of
+    several sensors on one actuator, which close one loop together, those of the whole."""
     structure, kappa = structure_of(run.problem), run.kappa
     assert kappa is not None
     if isinstance(structure, Structure):
@@ -139,10 +149,10 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
             u, v = decoupling.outputs[:, [i]], decoupling.inputs[:, [i]]
             plant, K = along_directions(run.plant, u, v), own.state_space(values)
             parts.append((LoopChannel(decoupling.names[i], u, v, plant, K), own, values))
-    found = []
+    found, sensors = [], bool(bounds_of(run.problem).places)
     for channel, own, values in parts:
         K = channel.controller
-        figures = run.measured(channel.plant, K)
+        figures = run.figures if sensors else run.measured(channel.plant, K)
         alone = ReducedController(len(K.A), Reduction.NONE, K, figures)
         found.append(ChannelOrders(channel, (alone,), alone, alone, (own, values)))
     return tuple(found)
@@ -201,7 +211,8 @@ def deploy(
     if kind_of(run.problem).as_designed:
         require_own_bounds(run, designed, timing)
         limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
-        orders, channels, small = designed_channels(run), whole_loop(run.plant, K), [K]
+        places = kind_of(run.problem).bounds().places
+        orders, channels, small = designed_channels(run), whole_loop(run.plant, K, places), [K]
         reduced, figures = K, full
     else:
         least = options.least_rate
@@ -255,10 +266,11 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     parts = [discretise(one.chosen.controller, found.conversion, period, found.delay)
              for one in found.orders]  # fmt: skip
     K = replace(assemble([one.channel for one in found.orders], parts), period=period)
-    inner, wider = run.problem.inner, 1.0 + target.excess
+    inner, wider, own = run.problem.inner, 1.0 + target.excess, kind_of(run.problem).bounds()
     bounds = Bounds(
         target.peak, inner.S_low * wider, inner.omega_low,
         compliance_max=None if most is None else most * wider,
+        channels=own.looser(target.excess).channels if own.places else (), error=own.error,
     )  # fmt: skip
     plants, sampling = as_written(run), Sampling(found.rate_hz, 1e6 * found.delay)
     judged = judge_loops(
@@ -267,11 +279,12 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     )  # fmt: skip
     if not judged.passed:
         return judged
-    kept = ["S_max", "S_low", *(["compliance_max"] if most is not None else [])]
+    where = f" (broken at {', '.join(one.name for one in own.places)})" if own.places else ""
+    kept = [f"S_max{where}", "S_low", *(["compliance_max"] if most is not None else [])]
     words = f"stable and within {', '.join(kept)} on {counted(len(plants), 'plant')}"
     figures = dict(judged.figures)
-    if kind_of(run.problem).as_designed and bounds_of(run.problem).weighted_level is not None:
-        own = replace(bounds_of(run.problem), channels=())
+    if own.weighted_level is not None:
+        own = own if own.places else replace(own, channels=())
         worst = certify(plants, K, own, sampling, integrator=False).worst
         figures |= {name: worst[name] for name in ("KS", "T")}
     return replace(judged, figures=figures, words=words)
@@ -326,6 +339,7 @@ def _assessed(
     reduction and the rate, by the fields of `Deployment`.
     """
     period, bandwidth = 1.0 / rate_hz, run.figures.bandwidth
+    places = kind_of(run.problem).bounds().places
     parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
     realisation = with_anti_windup(
         realise([o.channel for o in orders], parts, saturation), bandwidth
@@ -333,11 +347,10 @@ def _assessed(
     K, nominal = realisation.system, Perturbation()
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
     held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
-    loops = {at: closed_loop(G, K).S for at, G in held.items()}
-    figures = {at: sampled_figures(loop) for at, loop in loops.items()}
-    at_rest = statics(
-        plants[nominal], K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low
-    )
+    figures = {at: loop_figures(closed_loop(G, K), places) for at, G in held.items()}
+    loop = run.loop
+    at_rest = statics(loop.plant, K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low,
+                      places=places, ports=loop.ports if loop.ported else None)  # fmt: skip
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
         most = structured_of(run.problem).compliance_max
@@ -351,5 +364,5 @@ def _assessed(
     )  # fmt: skip
     if most is None or not found.stable:
         return found
-    gains = {at: sampled_compliance(plants[at], G, K) for at, G in held.items()}
+    gains = {at: sampled_compliance(plants[at], G, K, places) for at, G in held.items()}
     return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -28,6 +29,8 @@ class LoopChannel:
         Uᵀ G V.
     controller : StateSpace
         Vᵀ K U, SI.
+    places : tuple of BreakPoint
+        Of several sensors on one actuator.
     """
 
     name: str
@@ -35,12 +38,15 @@ class LoopChannel:
     inputs: Array
     plant: ScaledPlant
     controller: StateSpace
+    places: tuple[BreakPoint, ...] = ()
 
 
-def whole_loop(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
+def whole_loop(
+    plant: ScaledPlant, controller: StateSpace, places: tuple[BreakPoint, ...] = ()
+) -> tuple[LoopChannel, ...]:
     """The loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
-    return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller),)
+    return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller, places),)
 
 
 def scalar_channels(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.final_judgement import RobustCheckOptions, written_plants
 from ccd_casadi.deployment.realisation import LoopChannel, along_directions
@@ -20,7 +21,6 @@ from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncerta
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
 
 

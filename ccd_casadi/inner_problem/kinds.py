@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.evaluation import variances
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner, with_ports
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -272,13 +272,22 @@ def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace)
     Parameters
     ----------
     problem, plant, controller : CoDesignProblem, StateSpace, StateSpace
-        SI; of several sensors on one actuator the loop of the one whose error counts.
+        SI; of several sensors on one actuator the loop of the one whose error counts. A plant of
+        `with_ports` gives the loop its ports.
 
     Returns
     -------
     Loop
     """
-    return Loop(plant, controller, problem.sampling, kind_of(problem).bounds().places)
+    found = Loop(plant, controller, problem.sampling, kind_of(problem).bounds().places)
+    p, m = controller.B.shape[1], len(controller.C)
+    if plant.D.shape == (p, m):
+        return found
+    return replace(
+        found, plant=strictly_proper(plant.A, plant.B[:, :m], plant.C[:p]),
+        drive=plant.B[:, m:] if plant.B.shape[1] > m else None,
+        counted=plant.C[p:] if len(plant.C) > p else None,
+    )  # fmt: skip
 
 
 def design_loops(
@@ -296,7 +305,24 @@ def design_loops(
     list of Loop
         As they run, the model's first.
     """
-    plants = kind_of(problem).plants(theta)
+    plants = kind_of(with_ports(problem)).plants(theta)
+    return [loop_on(problem, plant.plant_si(), controller) for plant in plants]
+
+
+def member_loops(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> list[Loop]:
+    """Make the loops whose margins and steps are shown: as `design_loops`, with a robust set.
+
+    Parameters
+    ----------
+    problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
+
+    Returns
+    -------
+    list of Loop
+    """
+    plants = kind_of(with_ports(problem)).members(theta)
     return [loop_on(problem, plant.plant_si(), controller) for plant in plants]
 
 
@@ -326,8 +352,7 @@ def design_view(
     LoopView
     """
     bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
-    plants = kind_of(problem).members(theta)  # whose figures the result has
-    loops = [loop_on(problem, plant.plant_si(), controller) for plant in plants]
+    loops = member_loops(problem, theta, controller)  # whose figures the result has
     return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
 
 

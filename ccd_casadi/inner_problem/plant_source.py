@@ -17,7 +17,7 @@ from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed, with_wiring
 from ccd_casadi.plants.places import Places, placed
-from ccd_casadi.plants.plant import ModelFunction, Plant
+from ccd_casadi.plants.plant import ModelFunction, Plant, widened
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import (
@@ -182,6 +182,8 @@ class PlantSource:
         What lies before its forces and behind its sensors.
     given : GivenFunction or None
         A function of a program, whose `content` the program states.
+    wide : bool
+        With its disturbance as further inputs, and its performance as further outputs.
     """
 
     model: str | None
@@ -195,6 +197,7 @@ class PlantSource:
     motion: Motion | None = None
     wiring: Wiring = UNWIRED
     given: GivenFunction | None = field(default=None, compare=False)
+    wide: bool = False
 
     @property
     def name(self) -> str:
@@ -275,7 +278,9 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         motion = source.motion
         size = () if motion.motor is None else (motion.motor.size,)
         plant = _below(replace(source, motion=None), size, names, lower, upper)
-        return with_motion(plant, motion, names, source.held)
+        own = replace(source, motion=None, wide=False)  # motors are where its own inputs are
+        count = _below(own, size, names, lower, upper).inputs if source.wide else plant.inputs
+        return with_motion(plant, motion, names, source.held, count)
     held = source.held
     if source.places is not None:
         places = source.places
@@ -287,8 +292,13 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         assert model is not None
         plant = model.build((*names, *held), **dict(source.options))
     else:
-        function = fixed_model(_own_function(source), held)
-        return user_plant(function, names, dict(source.options), lower, upper)
+        function = _own_function(source)
+        function = fixed_model(widened(function) if source.wide else function, held)
+        plant = user_plant(function, names, dict(source.options), lower, upper)
+        if not plant.ports:
+            return plant
+        words = f"compliance and error budget are {plant.between}; the move's error too"
+        return replace(plant, notes=lambda theta: (*plant.notes(theta), words))
     return with_fixed(plant, held)
 
 

@@ -181,6 +181,42 @@ def plant_of(problem: CoDesignProblem) -> Plant:
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
 
 
+def with_ports(problem: CoDesignProblem) -> CoDesignProblem:
+    """Give a problem's plant its disturbance as inputs and its performance as outputs.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    CoDesignProblem
+        Itself where its plant has neither.
+    """
+    if not plant_of(problem).ports:
+        return problem
+    return replace(problem, source=replace(problem.source, wide=True))
+
+
+def refuse_ports(problem: CoDesignProblem, what: str) -> None:
+    """Refuse a problem whose plant says where other forces act, or where the error counts.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    what : str
+        Which does not know them, such as "controllers of full order".
+
+    Raises
+    ------
+    PlantError
+        It has.
+    """
+    if ports := plant_of(problem).ports:
+        words = f"{' and '.join(ports)} are not known to {what}"
+        raise PlantError(f"{words}; drop one or the other")
+
+
 def require_as_returned(problem: CoDesignProblem, theta: Sequence[float]) -> None:
     """Check that what is judged at θ are the matrices that a person's function returns there.
 

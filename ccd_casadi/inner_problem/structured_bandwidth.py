@@ -79,36 +79,35 @@ def require_motion(problem: CoDesignProblem) -> None:
         The plant has unlike numbers of inputs and outputs, or the move cannot be made.
     """
     plant = plant_of(problem)
-    if plant.inputs != plant.outputs:
+    motion = problem.source.motion
+    if plant.inputs != plant.outputs and not (motion and motion.output):
         words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
         raise PlantError(f"{words} of one as of the other")
     motion_of(problem, problem.start)
 
 
-def exact_moves(
-    problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
-) -> list[Move]:
-    """Simulate the move on plants.
+def exact_moves(motion: MotionAt, loops: Sequence[Loop]) -> list[Move]:
+    """Simulate the move in loops.
 
     Parameters
     ----------
-    problem, motion : CoDesignProblem, MotionAt
-    plants, K : sequence of ScaledPlant, StateSpace
-        K(s) in SI.
+    motion : MotionAt
+    loops : sequence of Loop
+        Closed, SI.
 
     Returns
     -------
     list of Move
-        Of each plant.
+        Of each loop.
     """
     profile = motion.cycle.profile
     return [
         simulate(
-            Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
+            loop, profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
             bandwidth_hz=MoveCheckOptions.steps / profile.duration,
         )
-        for plant in plants
+        for loop in loops
     ]  # fmt: skip
 
 
@@ -119,15 +118,16 @@ def exact_times(
 
     Parameters
     ----------
-    problem, motion, plants, K
-        As of `exact_moves`.
+    problem, motion : CoDesignProblem, MotionAt
+    plants, K : sequence of ScaledPlant, StateSpace
+        K(s) in SI.
 
     Returns
     -------
     array (plants,)
         s from the start of the move, its end at least.
     """
-    made = exact_moves(problem, motion, plants, K)
+    made = exact_moves(motion, [Loop(plant.plant_si(), K, problem.sampling) for plant in plants])
     return np.maximum([move.settled for move in made], motion.cycle.profile.duration)
 
 

@@ -25,6 +25,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem, of_sensor
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -78,6 +79,23 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         channels=_channel_bounds(problem),
         error=_error_channel(problem),
     )
+
+
+def break_points_of(problem: CoDesignProblem) -> tuple[BreakPoint, ...]:
+    """Find where the loop of several sensors on one actuator is broken.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    tuple of BreakPoint
+        Of the sensor whose error counts first; none of every other problem.
+    """
+    own = problem.controller
+    several = isinstance(own, StructuredProblem) and own.bandwidth_of is not None
+    return bounds_of(problem).places if several else ()
 
 
 def _error_channel(problem: CoDesignProblem) -> int | None:

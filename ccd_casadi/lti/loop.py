@@ -1,6 +1,6 @@
 """A loop as it runs: hold and delay, Tustin's rule, and S, T, KS and GS over frequency."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,6 +9,7 @@ from scipy.linalg import expm
 
 from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
+from ccd_casadi.lti.ports import Ports, ports_of
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
     StateSpace,
@@ -267,12 +268,42 @@ class Loop:
     at : tuple of BreakPoint
         Of several sensors on one actuator: first where the error counts, of which responses and S
         are, then the other places, which `peak` has too.
+    drive, counted : array (n, q), (z, n), optional
+        Where disturbing forces act and what of the states counts, where that is not the plant's own
+        B and C.
     """
 
     plant: StateSpace
     controller: StateSpace
     sampling: Sampling | None = None
     at: tuple[BreakPoint, ...] = ()
+    drive: Array | None = None
+    counted: Array | None = None
+
+    @cached_property
+    def ports(self) -> Ports:
+        """Where disturbing forces act, and what counts."""
+        return ports_of(self.plant, self.at, self.drive, self.counted)
+
+    @property
+    def ported(self) -> bool:
+        """Whether forces act, or the error counts, elsewhere than at its actuators and sensors."""
+        return self.drive is not None or self.counted is not None
+
+    def moved(self, omega: Array) -> np.ndarray:
+        """What counts per disturbing force (k, z, q), of a sampled loop at its instants."""
+        plant, ports, p = self.plant, self.ports, len(self.plant.C)
+        C = np.vstack([plant.C, ports.counted])
+        whole = replace(self, plant=strictly_proper(plant.A, plant.B, C), drive=None, counted=None)
+        (G, K), free = whole._responses(omega), strictly_proper(plant.A, ports.drive, C)
+        d = free.swept(omega)
+        u = np.linalg.solve(np.eye(G.shape[2]) + K @ G[:, :p], K @ d[:, :p])
+        return np.asarray(d[:, p:] - G[:, p:] @ u)
+
+    @property
+    def compliance(self) -> float:
+        """The largest σ_max of `moved`, m/N."""
+        return self._largest(lambda omega: sigma_max(self.moved(omega)))
 
     @property
     def places(self) -> "list[Loop]":
@@ -290,6 +321,8 @@ class Loop:
         if self.at and self.at[0].output:
             G, K = self._responses(omega)
             found["KS"] = K @ np.array([self.at[0].reference]).T / (1.0 + K @ G)
+        if self.ported:
+            found["GS"] = self.moved(omega)
         return found
 
     def _responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -311,11 +344,18 @@ class Loop:
         found = closed_loop(*self.as_run)
         if self.at:
             found = self.at[0].closed(found)
-        if self.sampling is None:
+        if self.sampling is None and not self.ported:
             return found
-        force = np.zeros((len(found.A), self.plant.B.shape[1]))
-        force[: len(self.plant.A)] = sampled(self.plant, self.sampling.period, 0.0).B
-        return replace(found, B_d=force)
+        drive, n = self.plant.B if self.drive is None else self.drive, len(self.plant.A)
+        force, counted = np.zeros((len(found.A), drive.shape[1])), None
+        force[:n] = drive
+        if self.sampling is not None:
+            held = strictly_proper(self.plant.A, drive, self.plant.C)
+            force[:n] = sampled(held, self.sampling.period, 0.0).B
+        if self.ported:
+            counted = np.zeros((len(self.ports.counted), len(found.A)))
+            counted[:, :n] = self.ports.counted
+        return replace(found, B_d=force, counted=counted)
 
     @property
     def period(self) -> float | None:
@@ -356,8 +396,11 @@ class Loop:
         if len(self.at) > 1:
             return max(one.peak for one in self.places)
 
+        return self._largest(lambda omega: sigma_max(self.sensitivity(omega)))
+
+    def _largest(self, of: Callable[[Array], Array]) -> float:
         def gain(omega: Array) -> Array:
-            return sigma_max(self.sensitivity(omega.ravel())).reshape(omega.shape)
+            return of(omega.ravel()).reshape(omega.shape)
 
         grid = self.grid()
         S = gain(grid)

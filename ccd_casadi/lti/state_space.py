@@ -206,6 +206,8 @@ class ClosedLoop:
     C_y, C_u, D_u : arrays (p, n), (m, n), (m, p)
     period : float
         s; 0: continuous.
+    counted : array (z, n), optional
+        What a force moves, where that is not y.
     """
 
     A: Array
@@ -215,6 +217,7 @@ class ClosedLoop:
     C_u: Array
     D_u: Array
     period: float = 0.0
+    counted: Array | None = None
 
     @cached_property
     def S(self) -> StateSpace:
@@ -228,8 +231,9 @@ class ClosedLoop:
 
     @cached_property
     def GS(self) -> StateSpace:
-        """d to y: (1 + GK)⁻¹G."""
-        return strictly_proper(self.A, self.B_d, self.C_y, self.period)
+        """d to y: (1 + GK)⁻¹G; or to what counts."""
+        C = self.C_y if self.counted is None else self.counted
+        return strictly_proper(self.A, self.B_d, C, self.period)
 
     @cached_property
     def KS(self) -> StateSpace:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ccd_casadi.plants.plant import (
     MATRICES,
+    PORTS,
     Evaluate,
     Mechanics,
     ModelFunction,
@@ -186,6 +187,7 @@ class _Values:
     def __init__(self, result: Mapping[str, Any]) -> None:
         self._matrices, self._ratio, scalars = model_parts(result, ca.DM)
         self.constraint_names = tuple(scalars)[1:]
+        self.ports = tuple(key for key in PORTS if key in result)
         self.scalars = np.array([float(value) for value in scalars.values()])
 
     @cached_property
@@ -259,6 +261,7 @@ class DifferencedModel:
         return Plant(
             names=self.names,
             constraint_names=middle.constraint_names,
+            ports=middle.ports,
             evaluate=self,
             hardware=ca.Function("hardware", [theta], [both[0], lam]),
             outputs=middle.system.C.shape[0],

@@ -2,7 +2,8 @@
 
 A model is a function of theta (a mapping of names to floats or CasADi symbols) and keyword
 options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one of `damping` or
-`damping_ratio`, `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0).
+`damping_ratio`, `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0),
+`disturbance` (where other forces act) and `performance` (where the error counts).
 (Paper, equations (1) and (2).)
 """
 
@@ -27,7 +28,8 @@ Evaluate = Callable[[Sequence[float]], "Mechanics"]
 
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 MATRICES = ("mass", "damping", "stiffness", "input", "output")
-_KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
+PORTS = {"disturbance": "input", "performance": "output"}  # optional, and what they stand beside
+_KNOWN = {*_REQUIRED, *PORTS, "damping", "damping_ratio", "constraints"}
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,8 @@ class Plant:
         Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
     shapes, drawing : callable, optional
         (θ, count) -> the lowest flexible modes for pictures; several θ by name -> a drawing.
+    ports : tuple of str
+        Of `PORTS` those that the model returns.
     callback : object
         What `hardware` calls, to which CasADi holds no reference.
     """
@@ -162,7 +166,14 @@ class Plant:
     mismatch: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
     drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
+    ports: tuple[str, ...] = ()
     callback: object = None
+
+    @property
+    def between(self) -> str:
+        """Where forces act and what they move, in words."""
+        acts = "of a force at `disturbance`" if "disturbance" in self.ports else "of an actuator's"
+        return f"{acts}, seen at {'`performance`' if 'performance' in self.ports else 'the sensor'}"
 
     @cached_property
     def slopes(self) -> ca.Function:
@@ -224,7 +235,35 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
         hardware=ca.Function("hardware", [theta], [f, lam]),
         outputs=found[4].shape[0],
         inputs=found[3].shape[1],
+        ports=tuple(key for key in PORTS if key in result),
     )
+
+
+def widened(model: ModelFunction) -> ModelFunction:
+    """Put a model's disturbance beside its input, its performance below its output.
+
+    Parameters
+    ----------
+    model : callable
+        model(theta, **options).
+
+    Returns
+    -------
+    callable
+        The same without these two.
+    """
+
+    def of_both(theta: Mapping[str, Any], **options: Any) -> Mapping[str, Any]:
+        found = dict(model(theta, **options))
+        for key, beside in PORTS.items():
+            if key in found:
+                own, other = found[beside], found.pop(key)
+                kind = ca.SX if isinstance(own, ca.SX) or isinstance(other, ca.SX) else ca.DM
+                join: Any = ca.horzcat if beside == "input" else ca.vertcat
+                found[beside] = join(kind(own), kind(other))
+        return found
+
+    return of_both
 
 
 def model_parts(
@@ -266,7 +305,8 @@ def model_parts(
             words = f"at most {most} are taken; reduce it to what matters (its first modes)"
             raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
-    _check_shapes(M, D, K, B, C)
+    ports = {key: _converted(kind, key, result[key]) for key in PORTS if key in result}
+    _check_shapes(M, D, K, B, C, ports)
     ratio = _damping_ratio(result.get("damping_ratio"))
     for key, value in constraints.items():
         if _is_comparison(value):
@@ -313,14 +353,18 @@ def _converted(kind: Any, key: str, value: object) -> Any:
     return kind(value)
 
 
-def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
+def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, Any]) -> None:
     """Raise PlantError unless M, D, K are (n, n), B (n, m) and C (p, n)."""
     n = M.shape[0]
     for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
         if matrix.shape != (n, n):
             raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
-    wanted = (("input", B, 0, f"({n}, m), a column a force"),
-              ("output", C, 1, f"(p, {n}), a row a sensor"))  # fmt: skip
+    wanted = [("input", B, 0, f"({n}, m), a column a force"),
+              ("output", C, 1, f"(p, {n}), a row a sensor")]  # fmt: skip
+    wanted += [(key, matrix, int(key == "performance"), form)
+               for key, matrix in ports.items()
+               for form in [f"({n}, q), a column a force" if key == "disturbance"
+                            else f"(z, {n}), a row an error"]]  # fmt: skip
     for key, matrix, side, form in wanted:
         if matrix.shape[side] != n:
             remedy = "transpose it" if matrix.shape[1 - side] == n else f"make it {n} on that side"

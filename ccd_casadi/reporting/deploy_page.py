@@ -1,5 +1,6 @@
 """report.html of a deployment: full, reduced and sampled loop, orders, sections."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,12 @@ from ccd_casadi.deployment.outcome import (
 )
 from ccd_casadi.deployment.source_code import COMPILE
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import Loop, Sampling
-from ccd_casadi.lti.state_space import sensitivity, sigma_max
+from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
@@ -33,6 +34,7 @@ from ccd_casadi.support.extensions import function
 from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 POINTS = 900
+BROKEN = (ORANGE, BLUE, GREEN, BLACK, GREY)  # loops of several sensors at their places
 PERIODS = 6.0  # of ω_b that the step is shown for
 
 
@@ -88,10 +90,10 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
     """The loops beside each other: name, colour, line; nothing is reduced of what was designed."""
-    G, K = run.plant.plant_si(), found.realisation.system
-    sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"
+    G, K, at = run.plant.plant_si(), found.realisation.system, kind_of(run.problem).bounds().places
+    sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay), at), "sampled", ORANGE, "-"
     if kind_of(run.problem).as_designed:
-        return (Loop(G, run.controller), "continuous", BLUE, "-"), sampled
+        return (Loop(G, run.controller, at=at), "continuous", BLUE, "-"), sampled
     full = Loop(G, run.controller), "full", BLUE, "-"
     return full, (Loop(G, found.reduced), "reduced", GREEN, "--"), sampled
 
@@ -103,15 +105,21 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
     curves, drawn = [], []
     for loop, name, colour, line in _loops(run, found):
-        G, K = loop.responses(HZ * hz)
-        label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
-        curves.append(c.Curve(hz, sigma_max(sensitivity(G @ K)), label, colour, line))
+        K = replace(loop, at=()).responses(HZ * hz)[1]
         drawn.append(c.Curve(hz, sigma_max(K), name, colour, line))
+        label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
+        if loop.at:
+            continue
+        curves.append(c.Curve(hz, sigma_max(loop.sensitivity(HZ * hz)), label, colour, line))
+    for one, colour in zip(loop.places if loop.at else [], BROKEN, strict=False):
+        S = np.abs(one.sensitivity(HZ * hz)[:, 0, 0])
+        curves.append(c.Curve(hz, S, f"broken at {one.at[0].name}", colour))
     S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
     crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
         bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
     )  # fmt: skip
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
+    of_S = "|S|" if kind_of(run.problem).bounds().places else named.format("S")
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{of_S} (–)")
     bottom = over_hz(spoken(f"{named.format('K')} (N/m)"), drawn, (low, nyquist), legend=None)
     title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
     ends = ", ".join(f"{with_unit(each.y[-1], spoken('N/m'))} ({each.label})" for each in drawn)
@@ -128,13 +136,16 @@ def _facts(run: FinishedRun, found: Deployment) -> tuple[c.Block, ...]:
 
 def _step(run: FinishedRun, found: Deployment) -> c.Figure:
     direction = found.orders[0].channel.outputs[:, 0]
+    if at := kind_of(run.problem).bounds().places:  # a setpoint of the one whose error counts
+        direction = np.ones(1)
     seconds = PERIODS * HZ / run.figures.bandwidth
     curves = []
     for loop, label, colour, line in _loops(run, found):
         t, outputs = step_response(loop, direction, seconds, POINTS)
         y = outputs @ direction
         curves.append(c.Curve(1e3 * t, y, label, colour, line))
-    where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
+    name = at[0].name if at else found.orders[0].channel.name
+    where = f", channel {name}" if at or len(direction) > 1 else ""
     panel = c.Panel("time (ms)", f"y{where} (of the step)", tuple(curves))
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
     return c.Figure(c.Lines(((panel,),), "Step of the reference", (3.0,)), caption)

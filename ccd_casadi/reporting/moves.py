@@ -16,7 +16,7 @@ from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.kinds import kind_of, loop_on
+from ccd_casadi.inner_problem.kinds import member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.plants.plant import mechanics
@@ -54,7 +54,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     else:
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
-        name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
+        name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
         other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
@@ -107,7 +107,7 @@ def cycle_chapter(
 def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
     """The position of every plant after a step of 1 N, of the pair that moves most."""
     K, bandwidth = view.loop.controller, HZ * view.bandwidth_hz
-    loops = [loop_on(problem, one.plant_si(), K) for one in kind_of(problem).members(theta)]
+    loops = member_loops(problem, theta, K)
     most, seconds = largest_force_step(loops, bandwidth), max(map(rest_time, loops))
     drawn = []
     for loop in loops:
@@ -122,7 +122,8 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, spoken("m")))
     step = f"y after a step of {spoken('1 N')} ({unit})"
     panel = c.Panel("time (ms)", step, curves, bands, log_x=True, marks=(mark,))
-    words = paragraph("report.force", most, len(loops), view.scalar)
+    scalar = view.scalar and not loops[0].ported
+    words = paragraph("report.force", most, len(loops), scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
 

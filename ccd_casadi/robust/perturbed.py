@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 import scipy
-from scipy.optimize import brentq
 
+from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.survival import (
@@ -22,10 +22,9 @@ from ccd_casadi.codesign.survival import (
 )
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import free_modal, plant_of
-from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
-from ccd_casadi.lti.loop import Loop, in_w
-from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sensitivity, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import mechanics
@@ -37,69 +36,10 @@ from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Progress
 
 
-@dataclass(frozen=True)
-class SampledFigures:
-    """The figures of a loop at its sampling instants.
-
-    Attributes
-    ----------
-    stable, spectral_radius : bool, float
-    sensitivity_peak, sensitivity_peak_frequency, bandwidth : float
-        ‖S‖∞, where it is, and ω_b, in rad/s; NaN where the loop is unstable.
-    """
-
-    stable: bool
-    spectral_radius: float
-    sensitivity_peak: float
-    sensitivity_peak_frequency: float
-    bandwidth: float
-
-
-def sampled_figures(S: StateSpace) -> SampledFigures:
-    """Measure a sampled loop: stability by eigenvalues, ‖S‖∞ and ω_b by level tests.
-
-    Parameters
-    ----------
-    S : StateSpace
-        In discrete time.
-
-    Returns
-    -------
-    SampledFigures
-    """
-    poles = np.linalg.eigvals(S.A)
-    radius = float(np.abs(poles).max())
-    if not radius < 1.0:
-        return SampledFigures(False, radius, np.nan, np.nan, np.nan)
-    return SampledFigures(True, radius, *hinf_norm(S), _bandwidth(S))
-
-
-def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
-    """Take the worst of each figure of loops that run side by side.
-
-    Parameters
-    ----------
-    parts : sequence of SampledFigures
-
-    Returns
-    -------
-    SampledFigures
-        The bandwidth is NaN where one has none.
-    """
-    top = max(parts, key=lambda f: f.sensitivity_peak)
-    stable = all(f.stable for f in parts)
-    radius = max(f.spectral_radius for f in parts)
-    if not stable:
-        return SampledFigures(False, radius, np.nan, np.nan, np.nan)
-    bandwidth = float(np.min([f.bandwidth for f in parts]))  # NaN where one has none
-    return SampledFigures(
-        True, radius, top.sensitivity_peak, top.sensitivity_peak_frequency, bandwidth
-    )
-
-
 def sampled_compliance(
-    plant: StateSpace, held: StateSpace, K: StateSpace, *, decades: int = 6, per_decade: int = 60
-) -> float:
+    plant: StateSpace, held: StateSpace, K: StateSpace, places: Sequence[BreakPoint] = (), *,
+    decades: int = 6, per_decade: int = 60,
+) -> float:  # fmt: skip
     """Find the compliance of a sampled loop, max over ω <= π/T of σ_max(S(e^{jωT}) G(jω)).
 
     A sinusoidal force f beside the held one acts continuously: the outputs at the instants are
@@ -112,6 +52,8 @@ def sampled_compliance(
         G in SI without hold and delay.
     held, K : StateSpace
         The plant with both, and the controller, in discrete time; their loop is stable.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: the first is whose error counts.
     decades, per_decade : int
         Of the grid below π/T, and its points in each.
 
@@ -126,32 +68,10 @@ def sampled_compliance(
 
     def gain(at: Array) -> Array:
         errors = sensitivity(held.response(at) @ K.response(at))
-        return sigma_max(errors @ plant.response(at))[None]
+        moved = errors @ plant.response(at)
+        return sigma_max(np.array([places[0].output]) @ moved if places else moved)[None]
 
     return highest(gain, grid)[0][0]
-
-
-def _bandwidth(S: StateSpace) -> float:
-    """The first ω at which σ_max(S) exceeds 1/√2; NaN where there is none.
-
-    Over w the circle is the axis, where a Hamiltonian matrix has imaginary eigenvalues at the
-    crossings. They are candidates, and the response itself decides. (SLICOT's AB13DD in discrete
-    time missed peaks of these loops: 1.737 instead of 1.877 in one.)
-    """
-    T, over_w = S.period, in_w(S)
-    parts = (np.ascontiguousarray(getattr(over_w, name)) for name in "ABCD")
-    found, info = axis_frequencies(*parts, HALF_POWER)
-    crossings = 2.0 / T * np.arctan(0.5 * T * found)
-    if info or not len(crossings):
-        return np.nan
-    last = min(2.0 * crossings[-1], np.pi / T)
-    ends = np.array([0.5 * crossings[0], *np.sqrt(crossings[1:] * crossings[:-1]), last])
-    above = sigma_max(S.response(ends)) > HALF_POWER
-    if above[0] or not above.any():
-        return np.nan
-    first = int(np.argmax(above))
-    excess = lambda omega: float(sigma_max(S.response(np.array([omega])))[0] - HALF_POWER)  # noqa: E731
-    return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))
 
 
 Figure = Callable[[Loop], float]
@@ -192,9 +112,9 @@ def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Pert
     """The run's controller on a plant."""
     plant = scale_plant(modal, run.problem.weights.M_K)
     if run.sampling is not None:
-        loop = run.loop_on(plant.plant_si()).closed.S
-        f = sampled_figures(loop)
-        height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.rates.real.max())
+        loop = run.loop_on(plant.plant_si())
+        f = loop_figures(closed_loop(*loop.as_run), loop.at)
+        height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.poles.real.max())
         return PerturbedLoop(place, f.stable, f.bandwidth, height, growth)
     figures = run.measured(plant, run.controller)
     stable = figures.certificate.stable

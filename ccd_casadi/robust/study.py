@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.margins import (
@@ -116,7 +117,7 @@ def robustness(
 
 
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
-    loop = run.loop_on(run.plant.plant_si())  # as it runs
+    loop = run.loop  # as it runs
     sampled, modal = loop.sampling is not None, run.modal()
     profile = setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
@@ -127,15 +128,31 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
     hz = np.append(view.hz, ends)
 
     def sizes(omega: Array) -> Array:
-        return gains(*loop.responses(omega))
+        if not (loop.at or loop.ported):
+            return gains(*loop.responses(omega))
+        S, found = [sigma_max(one.sensitivity(omega)) for one in loop.places], loop.curves(omega)
+        return np.array([np.max(S, 0), *(sigma_max(found[name]) for name in ("T", "GS", "KS"))])
+
+    def peaks() -> tuple[tuple[float, float], ...]:
+        if sampled:
+            return highest(sizes, HZ * hz)
+        S = max((norms(one.closed)[0] for one in loop.places), key=lambda top: top[0])
+        return S, *norms(loop.closed)[1:]
 
     return Study(
         demands=d,
         view=view,
-        peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
-        margins=margins(loop.responses, hz),
+        peaks=peaks(),
+        margins=margins(replace(loop, at=()).responses, hz),  # broken at every sensor and input
         noise=noise(loop, d.sensor, d.disturbance),
-        statics=statics(loop.plant, loop.controller, bandwidth=omega_b, omega_low=low),
+        statics=statics(
+            loop.plant,
+            loop.controller,
+            bandwidth=omega_b,
+            omega_low=low,
+            places=loop.at,
+            ports=loop.ports if loop.ported else None,
+        ),
         shift=shift_line(run, d.shift),
         damping=damping_line(run, *d.damping),
         modes=single_modes(run, d.shift),
@@ -150,7 +167,7 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
 def _moves(
     loop: Loop, modal: ModalPlant, profile: Setpoint, demands: Demands, bandwidth_hz: float
 ) -> tuple[Move, ...]:
-    ahead = mass_feedforward(modal, demands.axis)
+    ahead = mass_feedforward(modal, demands.axis, loop.at)
     found = moves(
         [loop], (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
         window=demands.window, bandwidth_hz=bandwidth_hz,

@@ -1,11 +1,15 @@
 """The loop at rest, and its largest compliance: what a force moves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import refine_peak
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.norms import gains, hinf_norm
+from ccd_casadi.lti.ports import Ports
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
@@ -61,7 +65,9 @@ class Statics:
         """One or two sentences."""
         low = f"{spoken('1 N')} at {self.low_hz:.3g} Hz moves it {with_unit(self.low, spoken('m'))}"
         if np.isinf(self.stiffness):  # a pole at rest
-            return f"The controller integrates: a constant force does not move the stage; {low}."
+            moved = f"moves it {with_unit(self.compliance, spoken('m'))}, beyond the sensors"
+            held = moved if self.compliance else "does not move the stage"
+            return f"The controller integrates: a constant force {held}; {low}."
         found = (
             f"Static stiffness K(0) = {with_unit(self.stiffness, spoken('N/m'))}: "
             f"a constant force of {spoken('1 N')} moves the stage "
@@ -81,6 +87,8 @@ def statics(
     *,
     bandwidth: float,
     omega_low: float,
+    places: Sequence[BreakPoint] = (),
+    ports: Ports | None = None,
     options: StaticsOptions = StaticsOptions(),
 ) -> Statics:
     """Stiffness and compliance of a loop at rest.
@@ -94,6 +102,11 @@ def statics(
         The plant continuous; SI.
     bandwidth, omega_low : float
         ω_b and the lowest frequency that counts, rad/s.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator: K is then the force per motion of the first, whose error
+        counts, while one force moves them all.
+    ports : Ports, optional
+        Where forces act and the error counts: compliances are of these, at rest near it.
     options : StaticsOptions
         Numbers of the method.
 
@@ -103,18 +116,31 @@ def statics(
         SI.
     """
 
+    row = np.array([places[0].output]) if places else np.eye(len(plant.C))
+
+    def moved(omega: float) -> np.ndarray:
+        return plant.response(np.array([max(omega, options.resting * omega_low)]))[0]
+
     def at(omega: float) -> np.ndarray:
-        return controller.response(np.array([omega]))[0]
+        K = controller.response(np.array([omega]))[0]
+        return K @ moved(omega) / (row @ moved(omega)) if places else K
 
     def compliance(omega: float, K: np.ndarray) -> float:
-        G = plant.response(np.array([max(omega, options.resting * omega_low)]))[0]
+        if ports is not None:
+            rate = Sampling(1.0 / controller.period) if controller.period else None
+            loop = Loop(plant, controller, rate, drive=ports.drive, counted=ports.counted)
+            at = np.array([omega])
+            found = loop.moved(at) if omega else loop.closed.GS.response(at)  # exact at rest
+            return float(np.linalg.norm(found[0], 2))
+        G = row @ moved(omega)
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))
     poles, T = controller.poles, controller.period
     rates = np.abs(poles - 1.0) / T if T else np.abs(poles)
     if rates.size and rates.min() <= options.integrator * bandwidth:
-        return Statics(np.inf, 0.0, np.inf, low, omega_low / HZ)
+        at_rest = 0.0 if ports is None else compliance(0.0, at(options.resting * omega_low))
+        return Statics(np.inf, at_rest, np.inf, low, omega_low / HZ)
     K0 = at(0.0)
     gains = np.linalg.svd(K0, compute_uv=False)
     share = gains[0] / max(float(np.linalg.norm(at(bandwidth), 2)), 1e-300)

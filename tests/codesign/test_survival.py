@@ -11,6 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.codesign.final_judgement import OtherDamping, survived
 from ccd_casadi.codesign.survival import (
     PEAK,
@@ -32,7 +33,6 @@ from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust import perturbed
-from ccd_casadi.robust.perturbed import sampled_figures
 
 SUSPENSION = FREE
 CROSSOVER = 100.0  # rad/s

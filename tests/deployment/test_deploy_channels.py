@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from oracles.case_documents import TWO_MASS
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -30,7 +31,6 @@ from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.reporting.deploy_page import deploy_page
-from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import measure

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.given_controller import with_controller
@@ -20,7 +21,7 @@ from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
+from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.text import HZ

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
 from ccd_casadi.extensions.rib_stage.plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.robust.perturbed import sampled_figures
 from oracles.sampled_simulation import measure_set
 
 RESULTS = Path(__file__).parents[2] / "benchmarks/rib_stage_built.json"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from oracles import rib_stage_built as built
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
@@ -19,7 +20,6 @@ from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.errors import UserError
 
 RUNS = Path(__file__).parents[2] / "runs"

@@ -76,7 +76,7 @@ def test_a_search_leaves_no_dip_at_the_bandwidth_unless_the_shape_ends_there() -
         made = synthesise_sections([plant()], Structure(), bounds, sampling=FAST, starts=4)
         assert made.certified
         loops = [Loop(plant().plant_si(), made.controller, FAST)]
-        entry = loop_entry([plant().plant_si()], made.controller, FAST, made.bandwidth, 2.0)
+        entry = loop_entry([Loop(plant().plant_si(), made.controller, FAST)], made.bandwidth, 2.0)
         bought = [words for words in entry["loop_warnings"] if "buys" in words]
         found[ends] = bandwidth_dip(loops, made.bandwidth), made.bandwidth, len(bought)
     assert found[ShapeEnd.S_MAX][0] == pytest.approx(1.0, abs=1e-4)

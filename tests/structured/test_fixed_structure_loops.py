@@ -17,6 +17,7 @@ from oracles.fixed_structure_loops import (
     response_and_slopes,
 )
 
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate import certify
@@ -37,7 +38,6 @@ from ccd_casadi.kernels import sections
 from ccd_casadi.lti.loop import in_w, sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
-from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.errors import PlantError
 
 STRUCTURES = [

@@ -47,7 +47,7 @@ def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
 def test_stability_is_lost_at_the_margins(seed: int, sampling: Sampling | None) -> None:
     """The gain margin by eigenvalues; a delay added to the loop likewise, sampled where it is."""
     G, K = pair(seed, sampling)
-    found = loop_entry([G], K, sampling, 20.0 * HZ, 1.5)
+    found = loop_entry([Loop(G, K, sampling)], 20.0 * HZ, 1.5)
     assert is_stable(G, K, sampling)
     gain = found["gain_margin"]
     beyond, inside = (1.001 * gain, 0.999 / gain), (0.999 * gain, 1.001 / gain)
@@ -165,7 +165,7 @@ def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
     assert named == {("pole", 0.05), ("zero", 0.02)}
     of_controller = [
         sum(words.startswith("the controller") for words in entry["loop_warnings"])
-        for entry in (loop_entry([G], each, None, w, 1.5) for each in (K, series))
+        for entry in (loop_entry([Loop(G, each)], w, 1.5) for each in (K, series))
     ]  # what rings of the closed loop is told besides
     assert of_controller[1] == of_controller[0] + 2
 
@@ -192,7 +192,7 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
     plant, controller = made.responses(omega)
     L = controller @ plant
     lines = measured_entry([(omega, L[:, 0, 0], np.abs(plant[:, 0, 0]))], K, w, 1.5)
-    exact = loop_entry([G], K, None, w, 1.5)
+    exact = loop_entry([Loop(G, K)], w, 1.5)
     assert lines["phase_margin_deg"] == pytest.approx(exact["phase_margin_deg"], abs=0.05)
     assert lines["gain_margin"] == pytest.approx(exact["gain_margin"], rel=1e-3)
     assert lines["delay_margin_us"] == pytest.approx(exact["delay_margin_us"], rel=1e-3)
@@ -272,7 +272,7 @@ def test_a_crossover_that_the_controller_adds_is_warned_of(
 ) -> None:
     """By a resonance of K: a warning; by one of the plant, or by none: no word."""
     entries = [
-        loop_entry([G], K, sampling, w / 2.0, 1.5)
+        loop_entry([Loop(G, K, sampling)], w / 2.0, 1.5)
         for G, K in (stage_and_lead(w, *sizes) for sizes in ((0.0, 60.0), (2.0, 0.0), (0.0, 0.0)))
     ]
     again = [[x for x in e["loop_warnings"] if "exceeds 1 again" in x] for e in entries]

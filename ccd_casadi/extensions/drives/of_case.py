@@ -14,6 +14,7 @@ from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
 from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.inner_problem.problem import refuse_ports
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
@@ -61,6 +62,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             raise UserError('controller.structure is not "sections"; a drive needs that')
         if problem.sampling is None:
             raise UserError("loop.rate_hz is missing; a drive is sampled, give its rate")
+        refuse_ports(problem, "[drive]")
         bounds = bounds_of(problem)
         require_known(bounds)
         filters: list[Slot] = []

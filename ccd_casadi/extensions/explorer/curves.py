@@ -10,6 +10,7 @@ from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
 from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS
+from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
@@ -26,7 +27,6 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.gain_figures import gain_panels
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import loci_of, loop_panels, nyquist_panel, size_panels
-from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, number, template, with_unit
 
@@ -99,7 +99,7 @@ def curves_of(look: Look) -> Curves | None:
     view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=peaks)
     time, step, move = NONE, NONE, AT_REST
     if loop.stable:
-        first = np.eye(len(loop.plant.C))[0]
+        first = np.eye(loop.closed.B_r.shape[1])[0]
         time, y = step_response(loop, first, STEP_PERIODS / bandwidth, STEP_POINTS)
         step, move = y[:, 0], _move(look, loop, bandwidth)
     return Curves(view, time, step, move)
@@ -108,8 +108,8 @@ def curves_of(look: Look) -> Curves | None:
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness."""
     ((made,),) = moves(
-        [loop], [mass_feedforward(look.modal, 0)], setpoint(LIMITS), axis=0, window=LIMITS.window,
-        bandwidth_hz=bandwidth_hz, options=MoveOptions(doublings=1),
+        [loop], [mass_feedforward(look.modal, 0, loop.at)], setpoint(LIMITS), axis=0,
+        window=LIMITS.window, bandwidth_hz=bandwidth_hz, options=MoveOptions(doublings=1),
     )  # fmt: skip
     return made.until(WATCHED * made.duration)
 

@@ -26,6 +26,7 @@ from ccd_casadi.inner_problem.problem import (
     design_choices,
     free_modal,
     plant_of,
+    refuse_ports,
     scaled_system,
 )
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
@@ -132,7 +133,9 @@ class Problems:
         loop = (knobs.sampled, knobs.rate_hz, knobs.delay_us)
         key = (knobs.structure, knobs.resonance_shift, *(loop if knobs.structured else ()))
         if key not in self._made:
-            self._made[key] = problem_of(case_at(self.case, knobs))
+            made = problem_of(case_at(self.case, knobs))
+            refuse_ports(made, "explore")
+            self._made[key] = made
         found = self._made[key]
         S, T = ((HZ * low, HZ * high) for low, high in (knobs.omega_S_hz, knobs.omega_T_hz))
         return replace(

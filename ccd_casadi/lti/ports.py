@@ -1,0 +1,102 @@
+"""What follows a setpoint, where disturbing forces enter a loop, and where its error counts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Where forces d act, what z counts, and what a setpoint s requires of them.
+
+        ẋ = A x + B u + E d,   y = C x,   z = F x = W U y + N x,   e = W s - z,   r = R s
+
+    Attributes
+    ----------
+    drive, counted : array (n, q), (z, n)
+        E and F, in the plant's states.
+    rows, reference, wanted : array (s, p), (p, s), (z, s)
+        U, R with U R = 1, and W.
+    beyond : array (z, n) or None
+        N: what the sensors do not see of z; None: nothing.
+    """
+
+    drive: Array
+    counted: Array
+    rows: Array
+    reference: Array
+    wanted: Array
+    beyond: Array | None = None
+
+
+def course(
+    plant: StateSpace, axis: int = 0, places: Sequence[BreakPoint] = ()
+) -> tuple[Array, Array]:
+    """Find what follows a setpoint, uᵀy, and the reference r of every output per setpoint.
+
+    One output has its own setpoint. Of several sensors on one actuator that follows it whose error
+    counts, and all have what they read of a force that moves the plant slowly: r = G/(uᵀG).
+
+    Parameters
+    ----------
+    plant : StateSpace
+        G, continuous, SI.
+    axis : int
+        The output, from 0; of several sensors on one actuator it is given by the first place.
+    places : sequence of BreakPoint
+
+    Returns
+    -------
+    u, r : array (p,)
+    """
+    if not places:
+        unit = np.eye(len(plant.C))[axis]
+        return unit, unit
+    output, G = np.array(places[0].output), moved_slowly(plant)[:, 0]
+    return output, G / (output @ G)
+
+
+def moved_slowly(plant: StateSpace, *, slow: float = 1e-5) -> Array:
+    """G (p, m) at a real s, `slow` of the slowest pole but those of a free body."""
+    rates = np.abs(plant.poles)
+    moving = rates[rates > slow**2 * rates.max()]
+    return np.asarray(plant.at(np.array([slow * moving.min(initial=rates.max())]))[0].real)
+
+
+def ports_of(
+    plant: StateSpace, places: Sequence[BreakPoint] = (), drive: Array | None = None,
+    counted: Array | None = None,
+) -> Ports:  # fmt: skip
+    """Find the ports of a plant.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        Continuous, SI.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator.
+    drive, counted : array (n, q), (z, n), optional
+        E and F; left out, forces act at the actuators, and the outputs count, or of several sensors
+        on one actuator the one of the first place. W is then what a slow force moves z by while it
+        moves what follows the setpoint by one.
+
+    Returns
+    -------
+    Ports
+    """
+    rows = reference = np.eye(len(plant.C))
+    if places:
+        output, r = course(plant, 0, places)
+        rows, reference = output[None], r[:, None]
+    E = plant.B if drive is None else drive
+    if counted is None:
+        return Ports(E, rows @ plant.C, rows, reference, np.eye(len(rows)))
+    read = np.vstack([rows @ plant.C, counted])
+    G = moved_slowly(StateSpace(plant.A, plant.B, read, np.zeros((len(read), plant.B.shape[1]))))
+    wanted = G[len(rows) :] @ np.linalg.pinv(G[: len(rows)])
+    return Ports(E, counted, rows, reference, wanted, counted - wanted @ read[: len(rows)])
