@@ -12,7 +12,7 @@ from ccd_casadi.extensions.rib_stage import reduced
 from ccd_casadi.extensions.rib_stage.geometry import Geometry, PointMass
 from ccd_casadi.extensions.rib_stage.mesh import COARSE
 from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, faded
-from ccd_casadi.extensions.rib_stage.plant import plant_of_stage
+from ccd_casadi.extensions.rib_stage.stage_plant import plant_of_stage
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.plants.registry import two_mass_plant
 from ccd_casadi.support.arrays import Array

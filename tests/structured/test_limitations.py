@@ -23,7 +23,7 @@ from ccd_casadi.extensions.limitations.bound import (
     support_of,
     upper_bound,
 )
-from ccd_casadi.extensions.limitations.command import main
+from ccd_casadi.extensions.limitations.gap_command import main
 from ccd_casadi.extensions.limitations.limits import (
     Limits,
     circle,
