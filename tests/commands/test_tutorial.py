@@ -53,7 +53,6 @@ def test_comparison_of_lines_can_fail() -> None:
     assert not same("status        verified", "status        not_verified")
 
 
-@pytest.mark.usefixtures("unpainted")
 @pytest.mark.parametrize(
     ("page", "wanted", "count", "but"),
     [

@@ -112,7 +112,6 @@ def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(
     assert failed > 0
 
 
-@pytest.mark.usefixtures("unpainted")
 def test_a_run_that_is_not_verified_is_refused_unless_asked(
     robust_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,7 +133,6 @@ def test_a_run_that_is_not_verified_is_refused_unless_asked(
     ).replace("NOT verified", "").replace("not been verified", "")
 
 
-@pytest.mark.usefixtures("unpainted")
 @pytest.mark.parametrize("lead", ["on", "off"])
 def test_a_rate_below_twice_the_peak_is_one_line(
     robust_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], lead: str
