@@ -150,7 +150,7 @@ def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
     compare_slopes(plant, theta)
 
 
-@few(20)
+@few(6)
 @given(inside, st.integers(0, 99), st.sampled_from([{"axes": True}, {"reference": CORNERS}]))
 def test_an_actuator_that_is_not_there_is_as_if_never_given(
     at: tuple[float, float], seed: int, how: dict[str, Any]

@@ -114,7 +114,7 @@ def test_the_present_controller_is_judged_beside_the_new_one(
     assert measured.hz[np.argmax(np.sqrt(0.5) < S)] == pytest.approx(now.bandwidth_hz, rel=0.04)
     np.savez(tmp_path / "G.npz", f_hz=measured.hz, G=measured.G)
     words = [str(tmp_path / "G.npz"), "--rate-hz", "5000", "--out", str(tmp_path / "out")]
-    words += ["--biquads", "0", "--least-damping", "0.02"]
+    words += ["--biquads", "0", "--least-damping", "0.02", "--workers", "1"]
     words += ["--controller", str(tmp_path / "now.json")]
     assert main(words) == 0
     printed = capsys.readouterr().out
