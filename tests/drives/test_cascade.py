@@ -9,7 +9,8 @@ from bench import RATE, SLOW, bounds, cascade, uncertain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.extensions.drives.cascade_search import Search, SearchOptions
+from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
+from ccd_casadi.extensions.drives.cascade_search import Search
 from ccd_casadi.extensions.drives.drive_data import known_drives, read_drive
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive, require_known
 from ccd_casadi.extensions.drives.forms import FORMS, Filter, Number, Rule

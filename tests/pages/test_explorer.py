@@ -23,16 +23,8 @@ from ccd_casadi.extensions.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.extensions.explorer.designs import (
-    How,
-    Problems,
-    Standing,
-    case_at,
-    elements_at,
-    judged,
-    knobs_of,
-    present,
-)
+from ccd_casadi.extensions.explorer.designs import How, Standing, elements_at, judged, present
+from ccd_casadi.extensions.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.inner_problem.problem import plant_of
