@@ -22,7 +22,7 @@ import rib_stage_built as built
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.run_folder import sections_kappa
+from ccd_casadi.cases.run_files import sections_kappa
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

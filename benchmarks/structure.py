@@ -22,7 +22,7 @@ OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
 # Rooms and modules whose numbers are sizes, colours and positions on a page.
 DRAWING = (
     "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.extensions.explorer.",
-    "ccd_casadi.extensions.records.picture", "ccd_casadi.extensions.measured.page",
+    "ccd_casadi.extensions.records.picture", "ccd_casadi.extensions.measured.measured_page",
     "ccd_casadi.extensions.rib_stage.pictures", "ccd_casadi.support.terminal",
 )  # fmt: skip
 # Numbers that no algorithm could take otherwise: of physics, units, file formats and other

@@ -27,7 +27,7 @@ COMMANDS = {
     "report": ("ccd_casadi.report", "draw the pages of a finished folder again"),
 }
 ALIASES = {"import": "imported"}
-TEMPLATE = ("plant.py", "case.toml")
+TEMPLATE = {"plant.py": "new_plant.py", "case.toml": "case.toml"}  # file -> in templates/
 SCHEMA = "case.schema.json"
 OWN = {
     "new": "write a plant and a case to begin with into a new folder",
@@ -100,8 +100,8 @@ def new(folder: Path) -> int:
         return _refuse(f"{folder}: {words}; choose another name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in TEMPLATE:
-            (folder / name).write_text(package_text(f"templates/{name}"), encoding="utf-8")
+        for name, own in TEMPLATE.items():
+            (folder / name).write_text(package_text(f"templates/{own}"), encoding="utf-8")
         schema = json.dumps(_schema().case_schema(), indent=1)
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:

@@ -84,7 +84,7 @@ def formulation_in(folder: Path) -> str:
 
     Raises UserError.
     """
-    from ccd_casadi.cases.run_folder import read_json
+    from ccd_casadi.cases.run_files import read_json
 
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such run folder; make one with a solve")

@@ -117,17 +117,37 @@ def blocks(
     d, a, b = z.shape
     K = np.empty((1 + d * rows, a, 1 + d * columns, b))
     K[0, :, 0] = phi[0]
-    for i in range(d):
-        slope = 2.0 * z[i] / length_scales[i]
-        if columns:
-            K[0, :, 1 + i] = -slope * phi[1]
-        if rows:
-            K[1 + i, :, 0] = slope * phi[1]
-        if rows and columns:
-            for j in range(d):
-                K[1 + i, :, 1 + j] = (-2.0 / length_scales[j]) * slope * z[j] * phi[2]
+    if not (rows or columns):
+        return K.reshape(a, b)
+    u = 2.0 * z / length_scales[:, None, None]
+    slopes = u * phi[1]
+    if rows:
+        K[1:, :, 0] = slopes
+    if columns:
+        K[0, :, 1:] = -slopes.transpose(1, 0, 2)
+    if rows and columns:
+        for i, curved in enumerate(u * phi[2]):
+            K[1 + i, :, 1:] = (-u * curved).transpose(1, 0, 2)
             K[1 + i, :, 1 + i] -= (2.0 / length_scales[i] ** 2) * phi[1]
     return K.reshape((1 + d * rows) * a, (1 + d * columns) * b)
+
+
+def blocks_weighed(W: Array, z: Array, phi: list[Array], length_scales: Array) -> Array:
+    """Sum W times the blocks of `covariance`, rows and columns of gradients in it, over these.
+
+    W is (a (1 + d), b (1 + d)) as the blocks are, or (a, b) of values alone; the sum is (a, b).
+    """
+    d, a, b = z.shape
+    if len(W) == a:
+        return np.asarray(W * phi[0])
+    V = W.reshape(1 + d, a, 1 + d, b)
+    u = 2.0 * z / length_scales[:, None, None]
+    slopes = (u * (V[1:, :, 0] - V[0, :, 1:].transpose(1, 0, 2))).sum(axis=0)
+    curved, own = np.zeros((a, b)), np.zeros((a, b))
+    for i in range(d):
+        curved += u[i] * (V[1 + i, :, 1:].transpose(1, 0, 2) * u).sum(axis=0)
+        own += (2.0 / length_scales[i] ** 2) * V[1 + i, :, 1 + i]
+    return np.asarray(V[0, :, 0] * phi[0] + (slopes - own) * phi[1] - curved * phi[2])
 
 
 def observed_covariance(
@@ -211,9 +231,7 @@ def log_likelihood(
     # K depends on log l_m in two ways. Through s, ds/dlog l_m = -2 z_m², which
     # shifts every φ to its derivative; and through the factors 1/l of the gradient
     # rows and columns, z_i/l_i going as l_i^-2 but the δ_ij term as l_i^-2 in all.
-    shifted = blocks(z, phi[1:], lengths, gradients, gradients)
-    components = targets.size // n
-    S = (W * shifted).reshape(components, n, components, n).sum(axis=(0, 2))
+    S, components = blocks_weighed(W, z, phi[1:], lengths), targets.size // n
     slope = np.empty(d + 3)
     slope[:d] = -np.tensordot(squares, S, axes=2)
     WK = W * C
@@ -234,6 +252,7 @@ def log_likelihood(
 
 def symmetric_inverse(L: Array) -> Array:
     """Return K⁻¹ in full from the lower Cholesky factor of K."""
-    inverse, _ = dpotri(L, lower=1)
-    lower = np.tril(inverse)
-    return lower + np.tril(inverse, -1).T
+    inverse, _ = dpotri(L, lower=1)  # above the diagonal it has the zeros of L
+    full = inverse + inverse.T
+    np.einsum("ii->i", full)[:] *= 0.5
+    return np.asarray(full)

@@ -13,7 +13,10 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from ccd_casadi.drawing import charts
 from ccd_casadi.support import time_budget
+
+PAINTS = {name: getattr(charts, name) for name in ("_draw", "to_svg")}
 
 # A shell's background job, or a CI runner, may have Ctrl-C ignored, and children inherit that.
 # The tests of interrupts are about how commands behave where it is not.
@@ -51,6 +54,23 @@ def timeless() -> None:
     time_budget.time = SimpleNamespace(monotonic=lambda: 1e9)  # type: ignore[attr-defined]
 
 
+@contextmanager
+def painting(on: bool) -> Iterator[None]:
+    """Pages of this process with pictures, or without: these take seconds a page."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, own in PAINTS.items():
+            patch.setattr(charts, name, own if on else lambda *_: "")
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def pictures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Pictures are drawn in the room of pages and by studies; other tests read the words."""
+    room, study = request.path.parent.name, request.config.option.markexpr == "slow"
+    with painting(room == "pages" or study):
+        yield
+
+
 @pytest.fixture(scope="session")
 def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
     """A folder by name for all processes of pytest-xdist, in a `with` that one enters at a time."""
@@ -80,7 +100,8 @@ def solved(common_folder: Callable[[str], Any]) -> Callable[[str], Path]:
             folder: Path = place / "run"
             if not folder.exists():
                 pages = [] if formulation == "lifted" else ["--no-report"]
-                assert run(place / "making", "--formulation", formulation, *pages) == 0
+                with painting(True):
+                    assert run(place / "making", "--formulation", formulation, *pages) == 0
                 (place / "making").rename(folder)
         return folder
 
@@ -125,12 +146,6 @@ def nannies(tmp_path: Path) -> Iterator[Any]:
         yield processes
     finally:
         processes.kill()
-
-
-@pytest.fixture
-def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages of this process without pictures, whose painting takes a second or two a page."""
-    monkeypatch.setattr("ccd_casadi.drawing.charts.to_svg", lambda *_: "")
 
 
 @pytest.fixture  # of one test: other event loops cannot run in this thread beside the browser's

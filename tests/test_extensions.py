@@ -50,38 +50,53 @@ def test_every_extension_of_a_message_is_there() -> None:
         assert there == of
 
 
+# Several commands in one process: each as `python -m` runs it, and what it ends with.
+ONE_BY_ONE = """
+import contextlib, io, json, runpy, sys
+answers = []
+for module, *words in json.loads(sys.argv[1]):
+    sys.argv = [module, *words]
+    with contextlib.redirect_stderr(io.StringIO()) as errors:
+        try:
+            runpy.run_module(module, run_name="__main__")
+        except SystemExit as end:
+            answers.append((end.code, errors.getvalue()))
+print(json.dumps(answers))
+"""
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: Path) -> None:
-    for word in shipped()[name].commands:
-        for words in (["-m", f"ccd_casadi.{word}"], ["-m", "ccd_casadi", word]):
-            done = run_without(tmp_path, name, words=words)
-            expected = f"`{word}` needs the extension {name}, which is not installed\n"
-            assert (done.returncode, done.stderr) == (2, expected)
-    for model in shipped()[name].plants:
-        case = tmp_path / "case.toml"
+    needs = f"needs the extension {name}, which is not installed\n"
+    own, asked = shipped()[name], list[tuple[list[str], str]]()
+    for word in own.commands:
+        for words in ([f"ccd_casadi.{word}"], ["ccd_casadi", word]):
+            asked.append((words, f"`{word}` {needs}"))
+    for model in own.plants:
+        case = tmp_path / f"{model}.toml"
         case.write_text(CASE.read_text().replace('"two_mass"', f'"{model}"'))
-        done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "check", str(case)])
-        words = f"'{model}' needs the extension {name}, which is not installed"
-        assert (done.returncode, done.stderr) == (2, f"{case}: plant.model: {words}\n")
+        line = f"{case}: plant.model: '{model}' {needs}"
+        asked.append((["ccd_casadi", "check", str(case)], line))
     if name == "cluster":
-        done = run_without(tmp_path, name, words=solve_words(tmp_path, "--scheduler", "tcp://a:1"))
-        expected = "--scheduler needs the extension cluster, which is not installed\n"
-        assert (done.returncode, done.stderr) == (2, expected)
+        words = [*solve_words(tmp_path, "--scheduler", "tcp://a:1")[1:]]
+        asked.append((words, f"--scheduler {needs}"))
     if name == "formats":
-        words = ["-m", "ccd_casadi.deploy", str(tmp_path), "--fmu"]
-        done = run_without(tmp_path, name, words=words)
-        expected = "--fmu needs the extension formats, which is not installed\n"
-        assert (done.returncode, done.stderr) == (2, expected)
-    done = run_without(tmp_path, name, words=["-m", "ccd_casadi", "foo"])
-    assert done.returncode == 2
-    assert all(f" {word}," not in done.stderr for word in shipped()[name].commands)
+        asked.append((["ccd_casadi.deploy", str(tmp_path), "--fmu"], f"--fmu {needs}"))
+    words = [words for words, _ in asked] + [["ccd_casadi", "foo"]]
+    done = run_without(tmp_path, name, words=["-c", ONE_BY_ONE, json.dumps(words)])
+    assert (done.returncode, done.stderr) == (0, "")
+    *answers, (code, unknown) = json.loads(done.stdout)
+    assert answers == [[2, line] for _, line in asked]
+    assert code == 2
+    assert all(f" {word}," not in unknown for word in own.commands)
 
 
 def test_the_core_solves_without_any_extension(tmp_path: Path) -> None:
-    done = run_without(tmp_path, *NAMES, words=["-c", IMPORTS])
-    assert (done.returncode, done.stderr) == (0, "")
-    words = solve_words(tmp_path, "--formulation", "lifted", "--no-report")
-    done = run_without(tmp_path, *NAMES, words=words)
+    case, quick = tmp_path / "case.toml", "[outer]\nstarts = 2\nbox_points = 0\n"
+    case.write_text(f"{CASE.read_text()}\n[sampling]\nlifted_points = 16\n{quick}")
+    words = [str(case), "--formulation", "lifted", "--no-report", "--quiet", "--workers", "1"]
+    solve = f"from ccd_casadi.solve import main; raise SystemExit(main({words}))"
+    done = run_without(tmp_path, *NAMES, words=["-c", f"{IMPORTS}\n{solve}"])
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 

@@ -4,10 +4,7 @@ What a run folder holds may come from somebody else, or from an older version: e
 checked, and the controller is certified again on the plant that the case file describes.
 """
 
-import json
-import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,8 +15,15 @@ import numpy as np
 from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_files import (
+    controller_of,
+    damaged,
+    number_of,
+    read_json,
+    sections_kappa,
+    theta_of,
+)
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.objective import final_design
 from ccd_casadi.inner_problem.problem import (
@@ -198,7 +202,7 @@ def read_run(folder: str | Path, *, options: RunFolderOptions = RunFolderOptions
         raise UserError(f"{folder / 'result.json'}: status: {words}")
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
-    theta = _theta(folder / "result.json", result, problem)
+    theta = theta_of(folder / "result.json", result, problem)
     if isinstance(problem.controller, StructuredProblem):
         found = _read_structured(folder, problem, theta, result)
     else:
@@ -240,15 +244,6 @@ def problem_at(
     return problem_of(case), None if theta is None else parse_theta(case, theta), None
 
 
-@contextmanager
-def _damaged(place: str, words: str) -> Iterator[None]:
-    """Raise UserError in these words where the block finds that a file holds something else."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{place}: {words}") from None
-
-
 def _read_mixed(
     folder: Path,
     problem: CoDesignProblem,
@@ -258,12 +253,12 @@ def _read_mixed(
 ) -> dict[str, Any]:
     """Weights, controller and figures of a run of mixed sensitivity, certified again at its γ."""
     path = folder / "result.json"
-    hz = [_number(path, result, key) for key in ("omega_S_hz", "omega_T_hz")]
+    hz = [number_of(path, result, key) for key in ("omega_S_hz", "omega_T_hz")]
     weights, plant = problem.weights.at(HZ * hz[0], HZ * hz[1]), scaled_plant(problem, theta)
-    controller = _controller(folder / "controller.json", plant)
+    controller = controller_of(folder / "controller.json", plant)
     certificate = result.get("certificate")
-    bound = _number(path, certificate if isinstance(certificate, Mapping) else {}, "norm_bound")
-    bound = max(bound, _number(path, result, "gamma"))
+    bound = number_of(path, certificate if isinstance(certificate, Mapping) else {}, "norm_bound")
+    bound = max(bound, number_of(path, result, "gamma"))
     # What a file says of γ is not relied on: it is at most that of a synthesis made anew.
     made = final_design(problem, theta, (HZ * hz[0], HZ * hz[1])).figures
     if made.certified and bound > made.certificate.norm_bound * (1.0 + options.gamma):
@@ -272,8 +267,8 @@ def _read_mixed(
     figures = measure(
         plant, controller, weights,
         gamma=bound * (1.0 + options.norm),
-        omega_low=problem.inner.omega_low, gamma_opt=_number(path, result, "gamma_opt"),
-        gamma_lower_bound=_number(path, result, "gamma_lower_bound"),
+        omega_low=problem.inner.omega_low, gamma_opt=number_of(path, result, "gamma_opt"),
+        gamma_lower_bound=number_of(path, result, "gamma_lower_bound"),
     )  # fmt: skip
     if not figures.certified:
         words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
@@ -333,7 +328,7 @@ def with_function(
     if "anchors" not in result:
         return problem  # of an earlier version
     words = "anchors, robust.set and seed are not those of a solve; solve the case again"
-    with _damaged(str(path), words):
+    with damaged(str(path), words):
         warm_starts, slower = (
             tuple(tuple(map(float, kappa)) for kappa in result.get(name, ()))
             for name in ("anchors", "error_anchors")
@@ -349,33 +344,6 @@ def with_function(
     return with_range(with_structured(problem, **known, scenarios=scenarios, seed=seed))
 
 
-def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
-    """Read the parameters of a fixed structure from the controller.json of a folder.
-
-    Parameters
-    ----------
-    folder : Path
-    structure : Structure or ChannelStructure
-
-    Returns
-    -------
-    tuple of float
-        κ in SI.
-
-    Raises
-    ------
-    UserError
-        It is of another structure.
-    """
-    path = folder / "controller.json"
-    words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
-    with _damaged(f"{path}: sections.kappa", f"{words}; name a run of this case"):
-        kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
-        if kappa.shape != (len(structure.names),) or not (np.abs(kappa) < 200.0).all():
-            raise ValueError("of another structure")
-    return tuple(map(float, kappa))
-
-
 def _with_directions(
     problem: CoDesignProblem, table: Mapping[str, Any] | None, path: Path
 ) -> CoDesignProblem:
@@ -384,7 +352,7 @@ def _with_directions(
     if not isinstance(table, Mapping) or "channels" not in table:
         return problem
     own = {channel.name: channel for channel in structured.channels}
-    with _damaged(f"{path}: sections.channels", "names no directions; solve the case again"):
+    with damaged(f"{path}: sections.channels", "names no directions; solve the case again"):
         channels = tuple(
             replace(
                 own.get(str(item["name"]), ChannelProblem(str(item["name"]), structured.structure)),
@@ -394,70 +362,3 @@ def _with_directions(
             for item in table["channels"]
         )
     return with_structured(problem, channels=channels)
-
-
-def read_json(path: Path) -> Mapping[str, Any]:
-    """Read a JSON object.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    mapping
-
-    Raises
-    ------
-    UserError
-        There is none.
-    """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file; solve the case first") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}; solve the case again") from None
-    except (ValueError, RecursionError):
-        raise UserError(f"{path}: is not valid JSON; solve the case again") from None
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: holds no JSON object; solve the case again")
-    return found
-
-
-def _number(
-    path: Path, table: Mapping[str, Any], key: str, low: float = 0.0, high: float = math.inf,
-    words: str = "is not a positive number",
-) -> float:  # fmt: skip
-    value = table.get(key.rpartition(".")[2])
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        raise UserError(f"{path}: {key}: {words}; solve the case again")
-    return float(value)
-
-
-def _theta(path: Path, result: Mapping[str, Any], problem: CoDesignProblem) -> tuple[float, ...]:
-    table, values = result.get("theta"), []
-    if not isinstance(table, dict) or set(table) != set(problem.names):
-        words = f"does not name {', '.join(problem.names)} as case.toml does; solve the case again"
-        raise UserError(f"{path}: theta: {words}")
-    for name, low, high in zip(problem.names, problem.lower, problem.upper, strict=True):
-        words, slack = (
-            f"is outside the bounds {low:g} to {high:g} of case.toml",
-            1e-9 * (high - low),
-        )
-        values.append(_number(path, table, f"theta.{name}", low - slack, high + slack, words))
-    return tuple(values)
-
-
-def _controller(path: Path, plant: ScaledPlant) -> StateSpace:
-    table, m, p = read_json(path), plant.B.shape[1], plant.C.shape[0]
-    found: dict[str, Array] = {}
-    for key in "ABCD":
-        with _damaged(f"{path}: {key}", "is not a matrix; solve the case again"):
-            found[key] = np.array(table[key], dtype=float)
-            n = len(found["A"])
-    for key, shape in {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}.items():
-        if found[key].shape != shape or not np.isfinite(found[key]).all():
-            words = f"is not a finite matrix {shape} for this plant; solve the case again"
-            raise UserError(f"{path}: {key}: {words}")
-    return StateSpace(*found.values())

@@ -12,7 +12,7 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import BINDS, Place, key_words, kind_and_channel
+from ccd_casadi.fixed_structure.bounds import BINDS, BrokenAt, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Structure
@@ -313,7 +313,7 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
             "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
             "bandwidth_ratio": own.bandwidth_ratio,
         }
-        if own.place is not Place.WHOLE:  # |S| where the loop is broken there alone
+        if own.place is not BrokenAt.WHOLE:  # |S| where the loop is broken there alone
             del entry["bandwidth_hz"], entry["bandwidth_ratio"]
             entry["place"] = own.place.value
         if own.M_K is not None:

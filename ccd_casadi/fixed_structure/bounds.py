@@ -100,7 +100,7 @@ class ShapeEnd(StrEnum):
     CROSSING = "crossing"
 
 
-class Place(StrEnum):
+class BrokenAt(StrEnum):
     """Where a channel's own |S| is taken.
 
     Attributes
@@ -132,7 +132,7 @@ class ChannelBounds:
     name : str
     output, force : tuple of float (p,), (m,)
         u makes its error uᵀe of the plant's, w its force wᵀf.
-    place, reference : Place, tuple of float (p,)
+    place, reference : BrokenAt, tuple of float (p,)
         Where |S| is taken; r of a sensor.
     S_max, bandwidth_ratio, M_K : float or None, float, float or None
         None, or a ratio of 1: no such bound. M_K in N/m.
@@ -144,7 +144,7 @@ class ChannelBounds:
     S_max: float | None = None
     bandwidth_ratio: float = 1.0
     M_K: float | None = None
-    place: Place = Place.WHOLE
+    place: BrokenAt = BrokenAt.WHOLE
     reference: tuple[float, ...] = ()
 
     @property
@@ -234,7 +234,7 @@ class Bounds:
         if self.error is None:
             return ()
         found = [BreakPoint(own.name, own.output, own.reference)
-                 if own.place is Place.SENSOR else BreakPoint(own.name)
+                 if own.place is BrokenAt.SENSOR else BreakPoint(own.name)
                  for own in self.channels]  # fmt: skip
         return (found[self.error], *found[: self.error], *found[self.error + 1 :])
 

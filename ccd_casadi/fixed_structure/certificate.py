@@ -20,10 +20,10 @@ from scipy.linalg import matrix_balance
 
 from ccd_casadi.fixed_structure.bounds import (
     Bounds,
+    BrokenAt,
     ChannelBounds,
     ChannelPeaks,
     LoopPeaks,
-    Place,
     key_words,
     kind_and_channel,
 )
@@ -268,7 +268,7 @@ def judged(
     norm, confirmed = norms(whole, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
-        broken = inputs if one.place is Place.ACTUATOR else loops
+        broken = inputs if one.place is BrokenAt.ACTUATOR else loops
         of_rows, certain = _rows(one, broken, table, grid, values, tops, options.curves)
         for k, figures in enumerate(of_rows):
             channels[k].append(figures)
@@ -381,7 +381,7 @@ def _rows(
         return [ChannelFigures(bounds.name)] * len(grid), np.ones(len(grid), bool)
     curve, u = f"S of {bounds.name}", np.array([bounds.output])
     missing = np.full(len(grid), np.nan)
-    if bounds.place is Place.WHOLE:
+    if bounds.place is BrokenAt.WHOLE:
         rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
         _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output, options)
     else:  # ω_b is of the one whose error counts
@@ -396,7 +396,7 @@ def _rows(
 
 def _entry(bounds: ChannelBounds, loop: StateSpace) -> StateSpace:
     """uᵀ S r of a sensor or wᵀ S w of an actuator, of what `loop` has of S."""
-    at_sensor = bounds.place is Place.SENSOR
+    at_sensor = bounds.place is BrokenAt.SENSOR
     left, right = (bounds.output, bounds.reference) if at_sensor else (bounds.force, bounds.force)
     row, column = np.array([left]), np.array([right]).T
     return StateSpace(loop.A, loop.B @ column, row @ loop.C, row @ loop.D @ column)

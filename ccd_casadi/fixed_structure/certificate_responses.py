@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import expm, matrix_balance, schur
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds, Place
+from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ChannelBounds
 from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
@@ -182,7 +182,7 @@ class LoopResponses:
         found = {"S": np.abs(entry), "KS": sigma_max(matrices["KS"]), "T": np.abs(1.0 - entry),
                  "GS": _length(own.output, matrices["GS"])}  # fmt: skip
         for one in self.bounds.channels:
-            at_sensor = one.place is Place.SENSOR
+            at_sensor = one.place is BrokenAt.SENSOR
             broken = matrices["S"] if at_sensor else matrices["S at the actuator"]
             found[f"S of {one.name}"] = np.abs(entry_of(one, broken))
         weights = self.weights(omega)
@@ -247,7 +247,7 @@ def _singular(M: np.ndarray) -> Array:
 
 def entry_of(bounds: ChannelBounds, M: np.ndarray) -> np.ndarray:
     """uᵀ M r of a sensor, wᵀ M w of an actuator, of matrices (..., p, m)."""
-    at_sensor = bounds.place is Place.SENSOR
+    at_sensor = bounds.place is BrokenAt.SENSOR
     left, right = (bounds.output, bounds.reference) if at_sensor else (bounds.force, bounds.force)
     return np.asarray(np.array(left) @ M @ np.array(right))
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ccd_casadi.fixed_structure.bounds import ChannelBounds, Place
+from ccd_casadi.fixed_structure.bounds import BrokenAt, ChannelBounds
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -169,12 +169,12 @@ def sensors_on_one_actuator(
     references = np.linalg.inv(decoupling.outputs).T  # rᵢᵀuⱼ is 1 for i = j, else 0
     places = [
         ChannelBounds(name, tuple(map(float, decoupling.outputs[:, i])), (1.0,),
-                      S_max=own.get(name, S_max), place=Place.SENSOR,
+                      S_max=own.get(name, S_max), place=BrokenAt.SENSOR,
                       reference=tuple(map(float, references[:, i])))
         for i, name in enumerate(decoupling.names)
     ]  # fmt: skip
     last = ChannelBounds("actuator", (0.0,) * len(decoupling.outputs), (1.0,),
-                         S_max=own.get("actuator", S_max), place=Place.ACTUATOR)  # fmt: skip
+                         S_max=own.get("actuator", S_max), place=BrokenAt.ACTUATOR)  # fmt: skip
     return (*places, last)
 
 

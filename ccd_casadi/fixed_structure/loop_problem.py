@@ -18,7 +18,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, Place, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.plant_set import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
@@ -226,7 +226,7 @@ class LoopProblem:
     @cached_property
     def _kinds(self) -> np.ndarray:
         """Kinds of the channels' own gains, as the kernels have them."""
-        kinds = dict(zip(Place, GainOf, strict=True))
+        kinds = dict(zip(BrokenAt, GainOf, strict=True))
         return np.array([kinds[one.place] for one in self.bounds.channels], np.int64)
 
     def plants_of(self, constraints: "RowPlaces") -> np.ndarray:

@@ -1,16 +1,13 @@
 """Quadratic programmes by their active sets, and quasi-Newton updates of their Hessians."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
-import casadi as ca
 import daqp
 import numpy as np
+from scipy import sparse
 
 from ccd_casadi.support.arrays import Array
-
-QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 
 
 @dataclass(frozen=True)
@@ -22,6 +19,7 @@ class QuadraticOptions:
     primal: float = 1e-10  # DAQP's tolerances
     dual: float = 1e-12
     zero: float = 1e-13
+    interior: float = 1e-10  # Clarabel's, of rows of size one
     unbounded: float = 1e30  # from here on DAQP takes a bound for infinite
     regularisation: float = 1e-8  # added to the diagonal of H: the solution is then unique
     slack_curvature: float = 1e-3  # of σ over ρ; with less DAQP starts far out and cycles
@@ -40,7 +38,7 @@ def solve_quadratic(
     H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array,
     options: QuadraticOptions = QuadraticOptions(),
 ) -> QuadraticSolution | None:  # fmt: skip
-    """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper, by DAQP, then by an interior point.
+    """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper, by DAQP, or else by Clarabel.
 
     Parameters
     ----------
@@ -72,12 +70,33 @@ def solve_quadratic(
     )  # fmt: skip
     if flag == 1 and feasible(x):
         return QuadraticSolution(x, np.maximum(info["lam"][n:], 0.0))
-    solver = _interior(n, m)
-    solution = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
-    x = np.array(solution["x"]).ravel()
-    if not solver.stats()["success"] or not feasible(x):
+    other = _interior(H, c, A, upper, low, high, options)
+    return other if other is not None and feasible(other.x) else None
+
+
+def _interior(
+    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array, options: QuadraticOptions
+) -> QuadraticSolution | None:  # fmt: skip
+    """The same by an interior point, for programmes whose rows differ by orders of magnitude: DAQP
+    finds no feasible x there."""
+    import clarabel  # slow to import, and seldom needed
+
+    m, n = A.shape
+    size = np.maximum(np.abs(A).max(axis=1, initial=0.0), np.finfo(float).tiny)
+    over, under = np.isfinite(high), np.isfinite(low)
+    rows = np.vstack([A / size[:, None], np.eye(n)[over], -np.eye(n)[under]])
+    right = np.concatenate([upper / size, high[over], -low[under]])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = options.interior
+    cones = [clarabel.NonnegativeConeT(len(right))]
+    curvature = sparse.csc_matrix(np.triu(H))
+    answer = clarabel.DefaultSolver(
+        curvature, c, sparse.csc_matrix(rows), right, cones, settings
+    ).solve()
+    if answer.status != clarabel.SolverStatus.Solved:
         return None
-    return QuadraticSolution(x, np.maximum(np.array(solution["lam_a"]).ravel(), 0.0))
+    return QuadraticSolution(np.array(answer.x), np.maximum(answer.z[:m], 0.0) / size)
 
 
 def solve_elastic(
@@ -138,15 +157,6 @@ def solve_elastic(
     multipliers = np.zeros(m)
     multipliers[rows] = unit * solution.multipliers
     return radius * np.clip(solution.x[:n], lower[:n], higher[:n]), multipliers
-
-
-@lru_cache(maxsize=256)
-def _interior(n: int, m: int) -> ca.Function:
-    """CasADi's primal-dual interior point for n variables and m rows, by dense QR."""
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(m, n)}
-    options: dict[str, bool | str] = dict.fromkeys(QUIET, False)
-    options["linear_solver"] = "qr"  # an LDL factorisation would warn on the terminal
-    return ca.conic("programme", "ipqp", shapes, options)
 
 
 def damped_bfgs(H: Array, s: Array, y: Array) -> Array:

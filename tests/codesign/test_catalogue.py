@@ -177,7 +177,7 @@ def all_listed(own: CoDesignProblem, solve: Any) -> list[Found]:
     ]
 
 
-@few(max_examples=60)
+@few(max_examples=10)
 @given(st.integers(0, 2**31))
 def test_the_best_listed_values_are_found_where_nodes_are_solved_globally(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -194,7 +194,7 @@ def test_the_best_listed_values_are_found_where_nodes_are_solved_globally(seed: 
     assert found["between"] <= found["combinations"] // 2
 
 
-@few(max_examples=40)
+@few(max_examples=15)
 @given(st.integers(0, 2**31))
 def test_five_by_five_values_take_fewer_searches_than_combinations(seed: int) -> None:
     """Bounds cut: the least of 25 takes 11 searches at most, of parts and combinations together."""
@@ -215,7 +215,7 @@ def test_five_by_five_values_take_fewer_searches_than_combinations(seed: int) ->
     assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
 
 
-@few(max_examples=40)
+@few(max_examples=15)
 @given(st.integers(0, 2**31), st.floats(0.0, 50.0))
 def test_a_first_search_that_ends_too_high_cuts_nothing_that_is_better(
     seed: int, missed: float
@@ -235,7 +235,7 @@ def test_a_first_search_that_ends_too_high_cuts_nothing_that_is_better(
     assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
 
 
-@few(max_examples=20)
+@few(max_examples=10)
 @given(st.integers(0, 2**31), st.sampled_from([0.0, -1.0, -1e3]))
 def test_the_best_is_judged_and_another_follows_where_that_costs_it_more(
     seed: int, shift: float
@@ -272,7 +272,7 @@ def test_the_best_is_judged_and_another_follows_where_that_costs_it_more(
         assert "%" not in words
 
 
-@few(max_examples=30)
+@few(max_examples=12)
 @given(st.integers(0, 2**31))
 def test_a_design_that_is_not_verified_cuts_no_verified_one(seed: int) -> None:
     """However low its J is: it is that of a design which breaks a bound."""

@@ -48,7 +48,7 @@ def in_unit(tmp_path_factory):
     return made
 
 
-@few(max_examples=60)
+@few(max_examples=20)
 @given(
     m1=st.floats(55.0, 70.0),
     share=st.sampled_from((-1e-3, -1e-5, -1e-7, -1e-8, 0.0, 1e-8, 1e-7, 1e-5, 1e-3)),

@@ -18,7 +18,7 @@ from surrogates import fit
 
 
 @given(place=st.floats(0.05, 0.95), jump=st.floats(0.01, 1.0), sloped=st.booleans())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_a_value_beyond_a_jump_is_learnt(place: float, jump: float, sloped: bool) -> None:
     X = np.linspace(0.0, 1.0, 6)[:, None]
     before = fit(X, X[:, 0], np.ones_like(X) if sloped else None, lower=[0.0], upper=[1.0])

@@ -1,6 +1,5 @@
 """Quadratic programmes: an answer is the optimum, and no answer is never taken for one."""
 
-import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
@@ -75,14 +74,25 @@ def test_of_thousands_of_rows_none_is_left_out(seed: int) -> None:
     assert np.delete(mu, -1).max() <= 1e-6 * mu[-1]
 
 
-class Refused:
-    """A solver of CasADi's whose answer is no success."""
-
-    def __call__(self, **programme: object) -> dict:
-        return {"x": ca.DM(programme["g"]) * 0.0, "lam_a": ca.DM(0), "cost": ca.DM(0)}
-
-    def stats(self) -> dict:
-        return {"success": False}
+@few(max_examples=20)
+@given(seed=SEEDS)
+def test_the_interior_point_ends_where_the_active_sets_do(seed: int) -> None:
+    """Rows of any size: it is asked where they differ too much for DAQP."""
+    rng = np.random.default_rng(seed)
+    n, m, options = 5, 40, QuadraticOptions()
+    root = rng.normal(size=(n, n))
+    H, c, inside = root.T @ root + np.eye(n), 10.0 * rng.normal(size=n), rng.uniform(-0.5, 0.5, n)
+    A, ends = rng.normal(size=(m, n)), (np.full(n, -1.0), np.full(n, 1.0))
+    upper = A @ inside + rng.uniform(0.0, 0.5, m)
+    by_sets = solve_quadratic(H, c, A, upper, *ends)
+    sizes = 10.0 ** rng.uniform(-3.0, 6.0, m)
+    by_interior = quadratic_programmes._interior(
+        H, c, sizes[:, None] * A, sizes * upper, *ends, options
+    )
+    assert by_sets is not None
+    assert by_interior is not None
+    assert by_interior.x == pytest.approx(by_sets.x, abs=1e-6)
+    assert sizes * by_interior.multipliers == pytest.approx(by_sets.multipliers, abs=1e-5)
 
 
 @pytest.fixture
@@ -97,10 +107,10 @@ def failing(monkeypatch: pytest.MonkeyPatch):
             x, value, flag, info = dual(*programme, **options)
             return x, value, -1 if left[0] else flag, info
 
-        def other(*shape: object) -> object:
+        def other(*programme: object) -> object:
             refused = left[0] > 0
             left[0] -= refused
-            return Refused() if refused else interior(*shape)
+            return None if refused else interior(*programme)
 
         monkeypatch.setattr(quadratic_programmes.daqp, "solve", solve)
         monkeypatch.setattr(quadratic_programmes, "_interior", other)

@@ -84,12 +84,6 @@ def test_a_tighter_tolerance_goes_on_from_the_samples(copy: Path) -> None:
     assert new[1]["version"]["parent"] == "0001"
 
 
-def test_a_run_keeps_the_name_of_its_formulation(tmp_path: Path) -> None:
-    """A `direct` run was called `lifted` once it had been trained again."""
-    _, (solution,) = job(tmp_path, "direct", budget=FIRST + 1)
-    assert solution.result["formulation"] == "direct"
-
-
 def test_an_interrupted_job_resumes(
     retrained: tuple[Path, RetrainingEnd, Solution], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,12 +110,14 @@ def test_an_interrupted_job_resumes(
 
 
 def test_a_budget_ends_a_job_and_is_the_folders(tmp_path: Path) -> None:
-    outcome, (solution,) = job(tmp_path, budget=FIRST + 1, tolerance=1e-12)
+    """A `direct` run keeps its name; it was called `lifted` once it had been trained again."""
+    outcome, (solution,) = job(tmp_path, "direct", budget=FIRST + 1, tolerance=1e-12)
     assert (outcome.reason, outcome.rounds) == ("budget", 1)
     assert solution.outcome.surrogates
-    again, written = job(tmp_path, budget=FIRST + 1, tolerance=1e-12)
+    assert solution.result["formulation"] == "direct"
+    again, written = job(tmp_path, "direct", budget=FIRST + 1, tolerance=1e-12)
     assert (again.reason, written) == ("nothing new", [])
-    more, _ = job(tmp_path, budget=outcome.spent + 3, tolerance=1e-12)
+    more, _ = job(tmp_path, "direct", budget=outcome.spent + 3, tolerance=1e-12)
     assert more.rounds == 3
 
 

@@ -25,7 +25,6 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("unpainted")
 def test_a_finished_run_is_retrained_in_a_copy(
     two_mass_run: Path,
     tmp_path: Path,

@@ -252,7 +252,8 @@ def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "formulation", ["nested", pytest.param("lifted", marks=pytest.mark.slow), "direct"]
+    "formulation",
+    ["nested", *(pytest.param(way, marks=pytest.mark.slow) for way in ("lifted", "direct"))],
 )
 def test_an_infeasible_case_says_what_and_by_how_much(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], formulation: str

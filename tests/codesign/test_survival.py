@@ -189,7 +189,7 @@ def test_no_range_hides_a_peak_or_an_instability(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 10**6), loose=st.sampled_from([2e-4, 1e-2]))
-@few(max_examples=4)
+@few(max_examples=2)
 def test_a_range_ends_where_s_max_does_unless_the_set_is_held_by_less(
     seed: int, loose: float
 ) -> None:
@@ -209,7 +209,7 @@ def test_a_range_ends_where_s_max_does_unless_the_set_is_held_by_less(
 
 
 @given(seed=st.integers(0, 10**6), delay=st.floats(0.0, 1.7))
-@few(max_examples=4)
+@few(max_examples=2)
 def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> None:
     """Hold and delay exact: the norm of `deployment`, which has level tests of its own."""
     case = drawn(seed)
@@ -315,7 +315,7 @@ def test_a_walk_meets_every_bump_that_its_steps_resolve(
 
 
 @given(seed=st.integers(0, 10**6), held=st.booleans())
-@few(max_examples=3)
+@few(max_examples=2)
 def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: bool) -> None:
     """One search, whatever places are drawn, and for K(z) as for the K(s) it is made of."""
     case = drawn(seed)

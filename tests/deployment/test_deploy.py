@@ -186,7 +186,6 @@ def test_the_command_leaves_a_controller_that_can_be_built(
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.usefixtures("unpainted")
 def test_a_rate_that_does_not_do_names_the_one_that_does(
     two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -211,7 +210,6 @@ def test_a_loop_without_a_bandwidth_is_refused_in_one_line(two_mass_run: Path) -
         deploy(lost, Timing())
 
 
-@pytest.mark.usefixtures("unpainted")
 def test_an_unstable_loop_leaves_no_code(
     two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

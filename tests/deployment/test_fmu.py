@@ -128,7 +128,6 @@ def test_a_compiler_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         compiled({"controller.c": "int x"})
 
 
-@pytest.mark.usefixtures("unpainted")
 @with_compiler
 def test_deploy_leaves_one_when_asked(two_mass_run: Path, tmp_path: Path) -> None:
     options = [str(two_mass_run), "--rate-hz", "16000", "--quiet"]

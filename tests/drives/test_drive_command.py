@@ -55,7 +55,7 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     case = tmp_path / "case.toml"
     case.write_text(text, "utf-8")
     out = tmp_path / "run"
-    code = main([str(case), "--starts", "2", "--today", str(today), "--out", str(out)])
+    code = main([str(case), "--starts", "1", "--today", str(today), "--out", str(out)])
     answer = json.loads((out / "drive.json").read_text())
     assert code == (0 if answer["status"] == "verified" else 4)
     assert (answer["status"] == "verified") == (

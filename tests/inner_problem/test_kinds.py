@@ -94,14 +94,14 @@ def counted(calls: Counter[str], name: str, honest: Any) -> Any:
 @pytest.fixture(scope="module", params=EACH)
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A solve and the same once more from its store, every synthesis counted."""
-    case, store = KINDS[request.param], tmp_path_factory.mktemp("kind") / "samples.sqlite"
+    case, store = lean(KINDS[request.param]), tmp_path_factory.mktemp("kind") / "samples.sqlite"
     made: tuple[Counter[str], Counter[str]] = (Counter(), Counter())
     ends = []
     for calls in made:
         with pytest.MonkeyPatch.context() as patch:
             for module, name in SYNTHESISE + UNITS:
                 patch.setattr(module, name, counted(calls, name, getattr(module, name)))
-            ends.append(solve(case, Lifted(points=4, box_points=4), store=store))
+            ends.append(solve(case, Lifted(points=4, box_points=2), store=store))
     return Run(case, *ends, made)
 
 

@@ -48,7 +48,7 @@ def anchored() -> CoDesignProblem:
     return found
 
 
-@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("sampled", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_envelope_gradient_is_the_slope_of_the_true_function(
     anchored: CoDesignProblem, sampled: bool
 ) -> None:

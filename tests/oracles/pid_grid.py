@@ -36,50 +36,61 @@ from oracles.pid_judge import Loop, Table, controller, judged, loop_of, near, po
 HZ = 2.0 * np.pi
 RESULTS = Path(__file__).parents[2] / "benchmarks/pid_grid.json"
 PID = Structure(integrator=True, lead=1, biquads=0, roll_off=1)
-COARSE = (8, 12, 10, 8)  # points of ln ω_i, z, p, r
-GAINS, LOCAL_GAINS = 36, 15
-BASINS, APART = 4, 0.8  # starts of a refinement, and by how much they differ in a logarithm
-SAMPLES, BEST, ROUNDS, SLACK = 250, 25, 28, 14  # in SLACK rounds bounds may be passed, ever less
 
 
-def refined(loop: Loop) -> tuple[float, np.ndarray, int]:
+@dataclass(frozen=True)
+class GridOptions:
+    """Numbers of the grid and of its refinements."""
+
+    coarse: tuple[int, ...] = (8, 12, 10, 8)  # points of ln ω_i, z, p, r
+    gains: int = 36
+    local_gains: int = 15
+    basins: int = 4  # starts of a refinement
+    apart: float = 0.8  # by how much they differ in a logarithm
+    samples: int = 250
+    best: int = 25
+    rounds: int = 28
+    slack: int = 14  # rounds in which bounds may be exceeded, ever less
+
+
+def refined(loop: Loop, options: GridOptions = GridOptions()) -> tuple[float, np.ndarray, int]:
     """The grid's best ω_b in rad/s, its κ, and how many controllers were looked at."""
-    table = Table.of(loop, loop.frequencies())
+    o, table = options, Table.of(loop, loop.frequencies())
     low, high = loop.low, loop.high
-    axes = [np.linspace(low[i + 1], high[i + 1], count) for i, count in enumerate(COARSE)]
+    axes = [np.linspace(low[i + 1], high[i + 1], count) for i, count in enumerate(o.coarse)]
     shapes = np.array([(0.0, *row) for row in itertools.product(*axes)])
     shapes = shapes[shapes[:, 3] <= shapes[:, 4]]  # p and r change places without a change of K
     # Gains that bring |K| to the same range at one frequency, however slow the zeros are.
     size = np.log(np.abs(controller(shapes, np.array([[1j * loop.crossover]]))))
-    gains = np.clip(np.linspace(high[0] - np.log(1e3), high[0], GAINS) - size, low[0], high[0])
+    gains = np.clip(np.linspace(high[0] - np.log(1e3), high[0], o.gains) - size, low[0], high[0])
     # Between the points of a grid bounds are passed by little: these too are worth refining.
     value = table.bandwidths(shapes, gains, slack=0.15)
     looked = value.size
     starts: list[np.ndarray] = []
     for flat in np.argsort(-value, axis=None):
         row, j = np.unravel_index(flat, value.shape)
-        if not np.isfinite(value[row, j]) or len(starts) == BASINS:
+        if not np.isfinite(value[row, j]) or len(starts) == o.basins:
             break
         kappa = shapes[row].copy()
         kappa[0] = gains[row, j]
-        far = all(np.abs(kappa - other).max() > APART for other in starts)
+        far = all(np.abs(kappa - other).max() > o.apart for other in starts)
         if far and (poles(loop, kappa).real < 0.0).all():
             starts.append(kappa)
     best, where = -np.inf, np.full(5, np.nan)
-    spacing = np.array([np.log(1e3) / GAINS, *(axis[1] - axis[0] for axis in axes)])
+    spacing = np.array([np.log(1e3) / o.gains, *(axis[1] - axis[0] for axis in axes)])
     for number, start in enumerate(starts):
         rng = np.random.default_rng(number)
         mean, cov, own, at = start, np.diag(spacing**2), -np.inf, start
         fine, seen = table, np.geomspace(0.3, 30.0, 400) * loop.crossover
-        for turn in range(ROUNDS):
-            if turn >= SLACK and (turn - SLACK) % 5 == 0:  # as the judge will see these loops
+        for turn in range(o.rounds):
+            if turn >= o.slack and (turn - o.slack) % 5 == 0:  # as the judge will see them
                 seen = np.concatenate([seen, near(poles(loop, mean), 40)])
                 fine = Table.of(loop, loop.frequencies(seen))
-            kappa = rng.multivariate_normal(mean, cov, SAMPLES)
+            kappa = rng.multivariate_normal(mean, cov, o.samples)
             kappa = np.clip(np.vstack([mean, at, kappa]), low, high)
             wide = max(2.0 * float(np.sqrt(cov[0, 0])), 1e-5)
-            local = np.clip(kappa[:, :1] + np.linspace(-wide, wide, LOCAL_GAINS), low[0], high[0])
-            slack = 0.15 * 0.6**turn if turn < SLACK else 0.0
+            local = np.clip(kappa[:, :1] + np.linspace(-wide, wide, o.local_gains), low[0], high[0])
+            slack = 0.15 * 0.6**turn if turn < o.slack else 0.0
             value = fine.bandwidths(kappa, local, slack)
             looked += value.size
             top = np.argmax(value, axis=1)
@@ -87,7 +98,7 @@ def refined(loop: Loop) -> tuple[float, np.ndarray, int]:
             value = value[np.arange(len(kappa)), top]
             chosen = []
             for row in np.argsort(-value):
-                if len(chosen) == BEST or not np.isfinite(value[row]):
+                if len(chosen) == o.best or not np.isfinite(value[row]):
                     break
                 if (poles(loop, kappa[row]).real < 0.0).all():
                     chosen.append(row)

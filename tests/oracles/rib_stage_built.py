@@ -25,7 +25,7 @@ from scipy.signal import cont2discrete
 
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
-from ccd_casadi.extensions.rib_stage.plant import rib_stage
+from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop

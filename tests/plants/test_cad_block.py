@@ -23,7 +23,7 @@ def block(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solid, "require", lambda package, extra: Block())
 
 
-@few(25)
+@few(10)
 @given(first=sizes, second=sizes, shear=st.floats(-15.0, 15.0), turn=st.integers(0, 11))
 def test_a_linear_change_of_the_solid_is_that_of_its_mesh(
     tmp_path_factory: pytest.TempPathFactory,

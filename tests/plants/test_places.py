@@ -53,7 +53,7 @@ POINTS = (("x", "y"), ("-x", 0.1), (0.05, "-y"))
 inside = st.tuples(st.floats(-0.25, 0.25), st.floats(-0.15, 0.15))
 
 
-@few(20)
+@few(8)
 @given(inside, st.integers(0, 99))
 def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed: int) -> None:
     between, point = NodeInterpolation(np.array(GRID)), np.array(at)
@@ -72,7 +72,7 @@ def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed
     assert between.left_out(values[None], point[None]) < 1e-8
 
 
-@few(20)
+@few(8)
 @given(inside, st.integers(0, 99))
 def test_slopes_are_those_of_differences(at: tuple[float, float], seed: int) -> None:
     """To 1e-6, of M, K, B and C to stiffness and positions."""
@@ -101,7 +101,7 @@ def compare_slopes(plant: Plant, theta: np.ndarray) -> None:
 SIX = (("x", "y"), ("-x", 0.13), (0.05, "-y"), (-0.2, -0.1), (0.22, 0.1), (-0.1, 0.02))
 
 
-@few(20)
+@few(8)
 @given(inside, st.integers(0, 99))
 def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], seed: int) -> None:
     """Forces of length 1 along 1, x, y and a damped mode, none on the quiet one."""
@@ -124,7 +124,7 @@ def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], s
 CORNERS = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
 
 
-@few(20)
+@few(8)
 @given(inside, st.integers(0, 99), st.sampled_from([3, 4]))
 def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
     at: tuple[float, float], seed: int, count: int
@@ -150,7 +150,7 @@ def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
     compare_slopes(plant, theta)
 
 
-@few(20)
+@few(6)
 @given(inside, st.integers(0, 99), st.sampled_from([{"axes": True}, {"reference": CORNERS}]))
 def test_an_actuator_that_is_not_there_is_as_if_never_given(
     at: tuple[float, float], seed: int, how: dict[str, Any]
@@ -177,7 +177,7 @@ def test_an_actuator_that_is_not_there_is_as_if_never_given(
     assert hardware_cost(dearer, parts) == pytest.approx(hardware_cost(plant, parts) + 0.5 * 3.9)
 
 
-@few(20)
+@few(8)
 @given(inside, st.floats(0.0, 2.0))
 def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
     at: tuple[float, float], kg: float

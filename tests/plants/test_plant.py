@@ -65,7 +65,7 @@ def rounding_of_stiffness(system: Mechanics, omega: np.ndarray) -> np.ndarray:
     return np.finfo(float).eps * np.linalg.norm(K, 2) * left * right / size
 
 
-@few(max_examples=40)
+@few(max_examples=20)
 @example(1, {"rigid": 2, "flexible": 5, "inputs": 1, "outputs": 1, "modal": False}, [0.5, 0.5], 3.0)
 @given(seeds, shapes, thetas, st.floats(3.0, 8.0))
 def test_scaled_plant_has_the_response_of_the_si_matrices(seed, shape, theta, exponent) -> None:
@@ -104,7 +104,7 @@ def test_states_are_stable_and_inputs_weigh_as_outputs(seed, shape) -> None:
     np.testing.assert_allclose(driven[both], measured[both], rtol=1e-12)
 
 
-@few(max_examples=8)
+@few(max_examples=4)
 @given(seeds, st.integers(1, 3))
 def test_grid_resolves_every_resonance_and_zero(seed: int, rigid: int) -> None:
     model = random_plant(seed, rigid=rigid, flexible=4, inputs=2, outputs=2)
@@ -258,7 +258,7 @@ def test_response_derivatives_match_differences_of_the_si_response(seed, shape, 
 
 
 @pytest.mark.parametrize("modal", [True, False])
-@few(max_examples=8)
+@few(max_examples=4)
 @given(seeds)
 def test_response_derivatives_are_exact_at_double_eigenvalues(modal: bool, seed: int) -> None:
     """At θ = 0 two flexible modes coincide, and two rigid modes always do; θ splits the former."""

@@ -70,8 +70,8 @@ def test_what_is_returned_in_another_form_is_named(tmp_path: Path, more: str, wo
 def test_a_plant_that_ends_the_process_ends_no_run_as_done(tmp_path: Path) -> None:
     case = case_of(tmp_path, f"if {AT}: __import__('os')._exit(0)")
     command = [sys.executable, "-m", "ccd_casadi.solve", str(case), "--out", str(tmp_path / "out")]
-    done = subprocess.run([*command, "--quiet"], cwd=ROOT, capture_output=True, text=True,
-                          timeout=300)  # fmt: skip
+    done = subprocess.run([*command, "--quiet", "--workers", "1"], cwd=ROOT, capture_output=True,
+                          text=True, timeout=300)  # fmt: skip
     assert done.returncode == 2
     assert "would end the program" in done.stderr
     assert not (tmp_path / "out/result.json").exists()

@@ -10,9 +10,9 @@ from oracles import rib_stage_built as built
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.run_folder import sections_kappa
+from ccd_casadi.cases.run_files import sections_kappa
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
-from ccd_casadi.extensions.rib_stage.plant import rib_stage
+from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main

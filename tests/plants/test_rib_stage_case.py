@@ -10,7 +10,7 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.final_judgement import check_on
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
-from ccd_casadi.extensions.rib_stage.plant import rib_stage
+from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.studies.sequential_hardware import design_hardware, first_resonance

@@ -75,8 +75,7 @@ def test_slopes_along_a_mixed_direction(name: str) -> None:
 def test_slopes_of_design_b_against_the_facts() -> None:
     """df/dθ of the twist in Hz/mm, from another program."""
     stage = RibStage()
-    row = next(i for i, m in enumerate(stage.frequencies(B)) if m.name == "B2")
-    f = stage.frequencies(B)[row].frequency
+    row, f = next((i, m.frequency) for i, m in enumerate(stage.frequencies(B)) if m.name == "B2")
     slope = stage.mechanics(B).derivatives[2][:, row, row] / (8.0 * np.pi**2 * f) * 1e-3
     np.testing.assert_allclose(slope, [-6.4, 2.1, 16.0, 8.9, 3.0, -0.3], atol=0.15)
 

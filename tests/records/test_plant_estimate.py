@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from oracles.closed_loops import RATE, Loop, by_ratio, random_loop, recorded
 
-from ccd_casadi.extensions.records.findings import findings
 from ccd_casadi.extensions.records.plant_estimate import (
     EstimateOptions,
     PlantEstimate,
     estimate_plant,
 )
+from ccd_casadi.extensions.records.record_findings import findings
 from ccd_casadi.extensions.records.time_series import TimeSeries
 from ccd_casadi.support.errors import UserError
 

@@ -160,7 +160,9 @@ def sensitivity(damping: float, shift: float, factor: float, K: StateSpace, hz: 
     return np.abs(1.0 / (1.0 + G * K.at(v)[:, 0, 0]))
 
 
-@pytest.mark.parametrize("damping", [2e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize(
+    "damping", [1e-3, *(pytest.param(each, marks=pytest.mark.slow) for each in (2e-4, 5e-3))]
+)
 def test_a_light_antiresonance_is_not_damped_by_a_suspension(damping) -> None:
     """The bandwidth that is found holds on the free body, also by code of its own: with a
     suspension of 0.1 Hz |S| was 3 times its bound at 6 Hz."""

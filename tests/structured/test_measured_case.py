@@ -20,7 +20,7 @@ from ccd_casadi.solve import main as solve
 from ccd_casadi.support.text import HZ
 
 
-@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("sampled", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_inner_designs_on_the_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], sampled: bool
 ) -> None:

@@ -96,7 +96,7 @@ def test_an_unstable_plant_of_the_box_is_never_proven() -> None:
         if not all(stable):
             break
     assert stable[0]
-    proof = prove(BOX, BOTH, hot, 0.1, replace(BARE, S_max=1e3), LATE, most_boxes=30_000)
+    proof = prove(BOX, BOTH, hot, 0.1, replace(BARE, S_max=1e3), LATE, most_boxes=8_000)
     assert not proof.stable
 
 

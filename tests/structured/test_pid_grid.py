@@ -9,12 +9,11 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import scale_plant
 
+SMALL = pid_grid.GridOptions(coarse=(4, 7, 6, 5), gains=24, basins=2, samples=100, best=12)
 
-def test_no_point_of_a_grid_is_better_than_the_search(monkeypatch) -> None:
+
+def test_no_point_of_a_grid_is_better_than_the_search() -> None:
     """Two masses, force and sensor apart: the search loses nothing to the grid, nor cheats it."""
-    small = {"COARSE": (4, 7, 6, 5), "GAINS": 24, "BASINS": 2, "SAMPLES": 100, "BEST": 12}
-    for name, value in small.items():
-        monkeypatch.setattr(pid_grid, name, value)
     case = pid_grid.CASES["ACC benchmark"]
     system = mechanics(build_plant(case.function, ("k",), {}), np.array([1.0]))
     suspension = Suspension(case.suspended_hz)
@@ -26,7 +25,7 @@ def test_no_point_of_a_grid_is_better_than_the_search(monkeypatch) -> None:
     own, over = pid_grid.judged(loop, made.kappa)
     assert over <= 1.0 + 1e-4
     assert own == pytest.approx(made.bandwidth, rel=1e-3)
-    _, kappa, looked = pid_grid.refined(loop)
+    _, kappa, looked = pid_grid.refined(loop, SMALL)
     grid, over = pid_grid.judged(loop, kappa)
     assert looked > 10_000
     assert over < 1.01

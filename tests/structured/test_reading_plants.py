@@ -53,7 +53,9 @@ def true_bandwidth(plant: object, K: StateSpace, rate: float) -> float:
     return float(min(crossing, (omega / x).min()))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "seed", [0, 2, 4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 3))]
+)
 def test_a_negative_gain_is_the_same_design_with_the_other_sign(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plant = [(1.0 - s / rng.uniform(3.0, 9.0)) / (s + 1.0) ** 2, 1.0 / (s + 1.0) ** 3,
@@ -72,7 +74,7 @@ def test_a_negative_gain_is_the_same_design_with_the_other_sign(seed: int) -> No
 
 @pytest.mark.parametrize(
     ("seed", "starts"),
-    [*((seed, 6) for seed in range(4)), (4, 3),
+    [*((seed, 3) for seed in range(5)),
      *(pytest.param(seed, 6, marks=pytest.mark.slow) for seed in range(4, 8))],
 )  # fmt: skip
 def test_undamped_modes_have_a_design_that_another_judge_confirms(seed: int, starts: int) -> None:
@@ -92,7 +94,8 @@ def test_undamped_modes_have_a_design_that_another_judge_confirms(seed: int, sta
 
 
 @pytest.mark.parametrize(
-    ("zeta", "hz"), [pytest.param(0.01, 100.0, marks=pytest.mark.slow), (1e-3, 60.0), (1e-2, 30.0)]
+    ("zeta", "hz"),
+    [(1e-3, 60.0), *(pytest.param(1e-2, hz, marks=pytest.mark.slow) for hz in (30.0, 100.0))],
 )
 def test_the_bandwidth_of_a_model_holds_between_lines(zeta: float, hz: float) -> None:
     w = ccd.HZ * hz
@@ -262,7 +265,7 @@ def test_the_bound_between_lines_falls_as_lines_are_added() -> None:
     K = design_on_data(lines(1.0, 0.0), ccd.Structure(biquads=1, least_damping=0.1), BOUNDS,
                        period=1.0 / RATE, starts=2, effort=20.0).controller  # fmt: skip
     assert K is not None
-    fine = np.geomspace(0.3, 1599.0, 100000)
+    fine = np.geomspace(0.3, 1599.0, 30000)
     loop = G.response(ccd.HZ * fine) @ controller_response(K, fine, 1.0 / RATE)
     truth = np.abs(1.0 / (1.0 + loop)).max()
     for noise, above in ((0.0, 1.001), (0.007, 1.15)):

@@ -138,8 +138,11 @@ def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
     assert better.tau > one.tau + 5.0 * MultiStartOptions.same
 
 
-@pytest.mark.parametrize("sampling", [None, FAST])
-@pytest.mark.parametrize("shape", [None, 1.5])
+@pytest.mark.parametrize(
+    ("shape", "sampling"),
+    [(1.5, FAST), *(pytest.param(*each, marks=pytest.mark.slow)
+                    for each in ((None, None), (1.5, None), (None, FAST)))],
+)  # fmt: skip
 def test_the_bandwidth_of_a_controller_is_the_judges(shape: float | None, sampling) -> None:
     """Also where |S| falls again below -3 dB: there one of four was given another, up to 180
     times the judge's."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import ccd_casadi as ccd
-from ccd_casadi.extensions.measured.command import main
 from ccd_casadi.extensions.measured.line_problem import LineProblem, line_problem
 from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
 from ccd_casadi.extensions.measured.present_controller import present_loop
+from ccd_casadi.extensions.measured.tune_command import main
 from ccd_casadi.extensions.measured.tuning import Tuned, tune
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import DesignOptions
@@ -114,7 +114,7 @@ def test_the_present_controller_is_judged_beside_the_new_one(
     assert measured.hz[np.argmax(np.sqrt(0.5) < S)] == pytest.approx(now.bandwidth_hz, rel=0.04)
     np.savez(tmp_path / "G.npz", f_hz=measured.hz, G=measured.G)
     words = [str(tmp_path / "G.npz"), "--rate-hz", "5000", "--out", str(tmp_path / "out")]
-    words += ["--biquads", "0", "--least-damping", "0.02"]
+    words += ["--biquads", "0", "--least-damping", "0.02", "--workers", "1"]
     words += ["--controller", str(tmp_path / "now.json")]
     assert main(words) == 0
     printed = capsys.readouterr().out

@@ -23,7 +23,7 @@ from ccd_casadi.extensions.cross_check.backends import (
     synthesise_with,
     verdicts,
 )
-from ccd_casadi.extensions.cross_check.command import main
+from ccd_casadi.extensions.cross_check.cross_check_command import main
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space

@@ -17,7 +17,7 @@ from ccd_casadi.synthesis.general_levels import HinfFailure, NoHinfController
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_the_loop_is_what_its_certificate_says(seed: int) -> None:
     P, p2, m2 = plant(seed)
     try:
@@ -35,7 +35,7 @@ def test_the_loop_is_what_its_certificate_says(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_no_other_controller_is_below_the_least_level(seed: int) -> None:
     """Controllers beside the central one, of other gain and with another part, as a judge."""
     P, p2, m2 = plant(seed)
@@ -57,7 +57,7 @@ def test_no_other_controller_is_below_the_least_level(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_the_least_level_is_of_no_coordinates_and_of_no_feedthrough(seed: int) -> None:
     P, p2, m2 = plant(seed)
     rng, (p1, m1) = np.random.default_rng(seed), (P.noutputs - p2, P.ninputs - m2)

@@ -63,7 +63,7 @@ def check_handed_out(plant: StateSpace, design: Design, per_decade: int) -> tupl
 # ---- the two-mass plant -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_every_two_mass_design_is_certified_and_sb10ad_agrees(count: int) -> None:
     rng = np.random.default_rng(11)
     compared = 0

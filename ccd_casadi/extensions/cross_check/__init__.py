@@ -5,7 +5,7 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "cross_check": (
-            "ccd_casadi.extensions.cross_check.command",
+            "ccd_casadi.extensions.cross_check.cross_check_command",
             "compare one synthesis by every back end",
         )
     }

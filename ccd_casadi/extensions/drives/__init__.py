@@ -6,7 +6,7 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "drive": (
-            "ccd_casadi.extensions.drives.command",
+            "ccd_casadi.extensions.drives.drive_command",
             "design an industrial drive's cascade, rounded and proven",
         )
     }

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.cascade_search import Candidate, Search, SearchOptions
+from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
+from ccd_casadi.extensions.drives.cascade_search import Candidate, Search
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.rounding import RoundingOptions, on_the_grid
 from ccd_casadi.fixed_structure.bounds import Bounds

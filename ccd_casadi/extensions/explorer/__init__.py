@@ -9,7 +9,7 @@ ASSETS = "extensions/explorer/assets"
 EXTENSION = Extension(
     commands={
         "explore": (
-            "ccd_casadi.extensions.explorer.command",
+            "ccd_casadi.extensions.explorer.explore_command",
             "drag the hardware and see the certified loop move",
         )
     }

@@ -15,6 +15,7 @@ from bokeh.models import (
     PointDrawTool,
     Range1d,
 )
+from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.inputs import Checkbox, Select
 from bokeh.models.widgets.markups import Div
 from bokeh.models.widgets.sliders import RangeSlider, Slider
@@ -25,7 +26,7 @@ from ccd_casadi.drawing.charts import GROUND, RING
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.paint import escape
 from ccd_casadi.drawing.svg import GREEN, ORANGE
-from ccd_casadi.extensions.explorer.designs import Knobs
+from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.painter import FEW, Change
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.nodes import Positions, names_in
@@ -379,3 +380,10 @@ class MapFigure:
         labels = [f"{self.names[i]} ({self._units[i][0]})".replace(" ()", "") for i in self.axes]
         self._figure.xaxis.axis_label, self._figure.yaxis.axis_label = labels
         self._words.text = f"<p>{escape(words)}</p>"
+
+
+def button(label: str, name: str, action: Callable[[], None]) -> Button:
+    """One of the page, 132 px wide; `name` is for tests."""
+    made = Button(label=label, name=name, width=132)
+    made.on_click(action)
+    return made

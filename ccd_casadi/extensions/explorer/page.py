@@ -11,7 +11,6 @@ from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, CustomJS, Range1d
-from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.cases.run_folder import read_run
@@ -21,6 +20,7 @@ from ccd_casadi.extensions.explorer.controls import (
     Controls,
     MapFigure,
     PlacesFigure,
+    button,
     landscape_of,
     moves,
     run_surrogate,
@@ -40,7 +40,8 @@ from ccd_casadi.extensions.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.extensions.explorer.designs import Designed, How, Knobs, Look, anchored, designed
+from ccd_casadi.extensions.explorer.designs import Designed, How, Look, anchored, designed
+from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.painter import (
     ON_DARK,
@@ -89,14 +90,13 @@ class ExplorerPage:
         run, problem = session.run, session.problems.at(session.start)
         self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
-        self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
-        self._of_search = False
+        self._open, self._moves = True, 0
+        self._scheduled = self._let_go = self._of_search = False
         self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
-        truths = read_truths(session.store.path, problem)
-        known = known_bandwidths(problem, self._surrogate, truths)
+        known = known_bandwidths(problem, self._surrogate, read_truths(session.store.path, problem))
         self.map.choose(steepest_axes(known, problem.lower, problem.upper))
         self.solve: Solve | None = None
         self._output: list[str] = []
@@ -109,19 +109,19 @@ class ExplorerPage:
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
-        self.design = _button("Design sections here", "design", self.design_structured)
+        self.design = button("Design sections here", "design", self.design_structured)
         self._designs, self._began = False, session.kappa is not None
-        self.solve_button = _button("Solve from here", "solve", self.start_solve)
-        self.stop = _button("Stop the solve", "stop", self.stop_solve)
+        self.solve_button = button("Solve from here", "solve", self.start_solve)
+        self.stop = button("Stop the solve", "stop", self.stop_solve)
         self.stop.disabled = True
         self._place()
         self.moved(True)
 
     def _place(self) -> None:
         buttons = [
-            _button("Pin this design", "pin", self.pin), _button("Go to selected", "go", self.go),
-            _button("Unpin selected", "unpin", self.pins.drop), self.design, self.solve_button,
-            self.stop, _button("Save as case", "save", self.write_case),
+            button("Pin this design", "pin", self.pin), button("Go to selected", "go", self.go),
+            button("Unpin selected", "unpin", self.pins.drop), self.design, self.solve_button,
+            self.stop, button("Save as case", "save", self.write_case),
         ]  # fmt: skip
         fill: Any = "stretch_width"
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
@@ -334,8 +334,6 @@ class ExplorerPage:
         else:  # the sliders moved meanwhile: it is judged where they are
             self.moved(True)
 
-    # pins, files, solves
-
     def pin(self) -> None:
         """Keep the present design beside those to come."""
         if self.now is not None:
@@ -343,8 +341,7 @@ class ExplorerPage:
 
     def go(self) -> None:
         """Move the sliders to the selected pin."""
-        pinned = self.pins.selected()
-        if pinned is not None:
+        if (pinned := self.pins.selected()) is not None:
             self.controls.put(pinned.look.knobs)
             self.moved(True)
 
@@ -378,8 +375,7 @@ class ExplorerPage:
     def _ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
         known = {exit_code.value: exit_code.words for exit_code in ExitCode}
-        words = known.get(code, f"exit code {code}")
-        self._said(f"the solve ended: {words}")
+        self._said(f"the solve ended: {known.get(code, f'exit code {code}')}")
         if code in (0, 4):
             self._go_to_solved()
         if (self._solved / "report.html").exists():
@@ -402,9 +398,3 @@ class ExplorerPage:
         self.stop_solve()
         self.session.keep(self._seen)
         self._seen = []
-
-
-def _button(label: str, name: str, action: Callable[[], None]) -> Button:
-    made = Button(label=label, name=name, width=132)
-    made.on_click(action)
-    return made

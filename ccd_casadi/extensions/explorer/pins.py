@@ -17,7 +17,8 @@ from bokeh.models.widgets.tables import (
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
 from ccd_casadi.extensions.explorer.curves import EMPTY, Drawn
-from ccd_casadi.extensions.explorer.designs import Knobs, Look
+from ccd_casadi.extensions.explorer.designs import Look
+from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.painter import ON_DARK, PanelFigure
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import display_unit

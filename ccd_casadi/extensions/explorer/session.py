@@ -16,18 +16,15 @@ from ccd_casadi.extensions.explorer.designs import (
     Designed,
     Elements,
     How,
-    Knobs,
     Look,
-    Problems,
     anchored,
-    case_at,
     elements_at,
     judged_look,
-    knobs_of,
     present,
     searched,
     without_controller,
 )
+from ccd_casadi.extensions.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -8,7 +8,7 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "imported": (
-            "ccd_casadi.extensions.imported.command",
+            "ccd_casadi.extensions.imported.imported_command",
             "make a modal table from result files; also: ccd import",
         )
     },

@@ -5,7 +5,7 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "gap": (
-            "ccd_casadi.extensions.limitations.command",
+            "ccd_casadi.extensions.limitations.gap_command",
             "bound what any controller reaches at one theta, as JSON",
         )
     },

@@ -37,7 +37,7 @@ MODEL = "the model"
 
 
 @dataclass(frozen=True)
-class Gap:
+class BandwidthGap:
     """Bounds on the bandwidth of every controller that keeps the bounds on the loop.
 
     Attributes
@@ -86,7 +86,7 @@ class Gap:
         return json_values(found)
 
 
-def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:
+def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> BandwidthGap:
     """The bound on every controller at θ.
 
     On the model it holds for every set that has the model in it.
@@ -102,7 +102,7 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
 
     Returns
     -------
-    Gap
+    BandwidthGap
         rad/s.
 
     Raises
@@ -117,14 +117,14 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
             bound = upper_bound(limits, found)
             if bound < found:
                 found, channel = bound, limits.name
-        return Gap(found, channel=channel)
+        return BandwidthGap(found, channel=channel)
     (model,) = loops
     pairs = opposite_corners(
         uncertain_plant(problem, theta), bounds_of(problem), structured_of(problem).sampling,
         integrator=model.integrator,
     )  # fmt: skip
     limits = forbids_most([model, *pairs])
-    gap = Gap(upper_bound(limits), plants="the set" if limits.others else MODEL)
+    gap = BandwidthGap(upper_bound(limits), plants="the set" if limits.others else MODEL)
     if not within:
         return gap
     most = upper_bound(model)
@@ -154,7 +154,7 @@ def opposite_corners(
     return found
 
 
-def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
+def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> BandwidthGap | None:
     """The upper bound alone, which takes seconds.
 
     Parameters
@@ -164,7 +164,7 @@ def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
 
     Returns
     -------
-    Gap or None
+    BandwidthGap or None
         None for a problem of another kind.
     """
     try:

@@ -5,12 +5,12 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "tune": (
-            "ccd_casadi.extensions.measured.command",
+            "ccd_casadi.extensions.measured.tune_command",
             "find the fastest PID with notches for a plant that exists",
         )
     },
     functions={
         "measured_answer": "ccd_casadi.extensions.measured.measured_answer:measured_answer",
-        "measured_page": "ccd_casadi.extensions.measured.page:measured_page",
+        "measured_page": "ccd_casadi.extensions.measured.measured_page:measured_page",
     },
 )

@@ -5,7 +5,7 @@ from ccd_casadi.support.extensions import Extension
 EXTENSION = Extension(
     commands={
         "record": (
-            "ccd_casadi.extensions.records.command",
+            "ccd_casadi.extensions.records.record_command",
             "estimate a plant's response from records of its loop",
         )
     }

@@ -2,4 +2,4 @@
 
 from ccd_casadi.support.extensions import Extension
 
-EXTENSION = Extension(plants={"rib_stage": "ccd_casadi.extensions.rib_stage.plant:MODEL"})
+EXTENSION = Extension(plants={"rib_stage": "ccd_casadi.extensions.rib_stage.stage_plant:MODEL"})

@@ -4,6 +4,9 @@ from ccd_casadi.support.extensions import Extension
 
 EXTENSION = Extension(
     commands={
-        "worth": ("ccd_casadi.extensions.worth.command", "estimate in seconds what co-design gains")
+        "worth": (
+            "ccd_casadi.extensions.worth.worth_command",
+            "estimate in seconds what co-design gains",
+        )
     }
 )

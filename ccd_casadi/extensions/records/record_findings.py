@@ -11,7 +11,7 @@ from ccd_casadi.support.text import counted
 
 
 @dataclass(frozen=True)
-class FindingOptions:
+class RecordFindingOptions:
     """Limits beyond which something is named.
 
     Attributes
@@ -29,13 +29,15 @@ class FindingOptions:
     joined: float = 1.1
 
 
-def ranges(hz: Array, chosen: np.ndarray, options: FindingOptions = FindingOptions()) -> str:
+def ranges(
+    hz: Array, chosen: np.ndarray, options: RecordFindingOptions = RecordFindingOptions()
+) -> str:
     """Write the ranges of some lines.
 
     Parameters
     ----------
     hz, chosen : array (k,), bool array (k,)
-    options : FindingOptions
+    options : RecordFindingOptions
 
     Returns
     -------
@@ -58,7 +60,7 @@ def _runs(hz: Array, joined: float) -> Iterator[tuple[float, float]]:
 
 def findings(
     found: PlantEstimate, period: float, estimate: EstimateOptions,
-    options: FindingOptions = FindingOptions(),
+    options: RecordFindingOptions = RecordFindingOptions(),
 ) -> list[tuple[str, str]]:  # fmt: skip
     """List what is to be known of an estimate.
 
@@ -68,7 +70,7 @@ def findings(
         On all its lines.
     period : float
         s, of the samples.
-    estimate, options : EstimateOptions, FindingOptions
+    estimate, options : EstimateOptions, RecordFindingOptions
 
     Returns
     -------

@@ -34,9 +34,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Estimate, print a table, write response.npz, response.csv and response.png."""
     import numpy as np
 
-    from ccd_casadi.extensions.records.findings import findings
     from ccd_casadi.extensions.records.picture import record_picture
     from ccd_casadi.extensions.records.plant_estimate import EstimateOptions, estimate_plant
+    from ccd_casadi.extensions.records.record_findings import findings
     from ccd_casadi.extensions.records.time_series import SignalNames, read_record
     from ccd_casadi.support.text import use_units
     from surrogates.files import write_whole

@@ -1,0 +1,292 @@
+"""|S| of a cascade at every place over its bound, on some plants and a grid of frequencies.
+
+Rows are ln of |S| over its bound, with the exact slopes of the drive's own difference equations.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.extensions.drives.cascade import Cascade
+from ccd_casadi.extensions.drives.forms import Filter, Number
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.text import HZ
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Numbers of the search.
+
+    Attributes
+    ----------
+    starts, stages, steps : int, tuple of (float, int), int
+        Starting points; steps from each, and the share of them that is kept then; steps from these.
+    refinements, finer : int, int
+        Of the grid by the peaks between its points, and points of the finer one to one of its.
+    alert, missed, met : float
+        Share below a bound from which on a peak is added, and by how much it exceeds the grid's
+        values beside it; ln of a figure over its bound that counts as met.
+    points : int
+        Of the grid of frequencies, as many again spread evenly; more lie about resonances.
+    lowest, last : float
+        Of the grid, over ω_low and over half the sampling rate.
+    penalty : float
+        ρ, per violation of one (natural) logarithm.
+    radius, least_radius, grow, shrink : float
+        Δ at first and at the end, and how it changes.
+    rows, violated : int, float
+        Rows that a programme begins with, and by which it grows; the least violation of one.
+    room : float
+        Share of every bound that is kept for what lies between the grid's points.
+    dampings, frequencies : tuple of float
+        Of the filters at a start: numerator and denominator damping, and Hz.
+    spread : float
+        Of gains at a start, in logarithms.
+    retreats : int
+        Halvings of a start's gains until every loop is stable.
+    gains : float
+        Kv over the frequency of the first bandwidth that is tried; Kp over mass times it.
+    bandwidth : float
+        Hz, of a start.
+    highest : float
+        Frequency of a filter over the sampling rate: next to half of it features are narrow.
+    difference : float
+        Of logarithms, for the slopes of fixed-point coefficients.
+    least_damping, most_damping : float, float
+        Of a filter's denominator, below which a filter is a needle; of all, above which it is two
+        of first order far apart.
+    """
+
+    starts: int = 24
+    stages: tuple[tuple[float, int], ...] = ((0.5, 50), (0.1, 50))
+    steps: int = 40
+    refinements: int = 10
+    finer: int = 8
+    alert: float = 5e-3
+    missed: float = 5e-5
+    last: float = 0.999999
+    met: float = 4e-4
+    points: int = 200
+    lowest: float = 0.2
+    penalty: float = 30.0
+    radius: float = 0.3
+    least_radius: float = 1e-5
+    grow: float = 1.6
+    shrink: float = 0.4
+    rows: int = 60
+    violated: float = 1e-6
+    room: float = 5e-4
+    dampings: tuple[float, float] = (0.6, 0.65)
+    frequencies: tuple[float, float] = (80.0, 2500.0)
+    spread: float = 0.3
+    retreats: int = 10
+    gains: float = 1.0
+    bandwidth: float = 15.0
+    highest: float = 0.4
+    difference: float = 1e-5
+    least_damping: float = 0.1
+    most_damping: float = 2.0
+
+
+class CascadeRows:
+    """Rows of a cascade on some plants.
+
+    Parameters
+    ----------
+    cascade, bounds, sampling : Cascade, Bounds, Sampling
+    plants : sequence of StateSpace
+        SI, continuous.
+    options : SearchOptions
+    """
+
+    def __init__(
+        self, cascade: Cascade, bounds: Bounds, sampling: Sampling, plants: Sequence[StateSpace],
+        options: SearchOptions = SearchOptions(),
+    ) -> None:  # fmt: skip
+        self.cascade, self.bounds, self.options = cascade, bounds, options
+        T = sampling.period
+        self.systems = [sampled(plant, T, sampling.delay) for plant in plants]
+        rates = np.concatenate([np.abs(plant.rates) for plant in plants])
+        near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
+        about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
+        top, self.period = options.last * np.pi / T, T
+        grid = np.geomspace(options.lowest * bounds.omega_low, top, options.points)
+        even = np.linspace(0.0, top, options.points)[1:]
+        parts = [grid, even, about[about < top], np.array([bounds.omega_low])]
+        self.on(np.unique(np.concatenate(parts)))
+        ranges = cascade.ranges.copy()
+        for i, setting in enumerate(cascade.settings):
+            if "denominator" in setting.name and not setting.unit:
+                ranges[0, i] = max(ranges[0, i], options.least_damping)
+            if "damping" in setting.name:
+                ranges[1, i] = min(ranges[1, i], options.most_damping)
+        self.hertz = hertz = np.array([setting.unit == "Hz" for setting in cascade.settings])
+        ranges[1, hertz] = np.minimum(ranges[1, hertz], options.highest / T)
+        self.low, self.high = np.log(ranges)
+        self.mass = self._mass(plants[0])
+
+    def on(self, omega: Array) -> None:
+        """Take another grid of frequencies."""
+        self.omega, self.z = omega, np.exp(1j * omega * self.period)
+        self.G = [system.swept(omega)[:, :, 0].T for system in self.systems]
+
+    def _mass(self, plant: StateSpace) -> float:
+        """kg that the force moves as seen by the position's sensor, by G at ω_low."""
+        w = self.bounds.omega_low
+        G = plant.at(1j * np.array([w]))[0, self.cascade.position, 0]
+        return float(1.0 / (abs(G) * w * w))
+
+    def stable(self, values: Array) -> bool:
+        """Whether every plant's loop is."""
+        K = self.cascade.state_space(values)
+        for G in self.systems:
+            A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+            if not np.abs(np.linalg.eigvals(A)).max() < 1.0 - 1e-9:
+                return False
+        return True
+
+    def rows(self, kappa: Array, log_band: float) -> tuple[Array, Array]:
+        """c (m,) and ∇c (m, n + 1) to the parameters' logarithms and ln ω_b."""
+        b, w = self.bounds, self.omega
+        K, dK = self.cascade.responses(np.exp(kappa), self.z)
+        x = w / np.exp(log_band)
+        above = x > 1.0
+        if b.shape is not None:
+            room = b.room(x)
+            shape = np.log(room * x / np.sqrt(2.0))
+            by_x = 1.0 + np.where(above & b.opens, 2.0 * (b.shape - 1.0) / x**2 / room, 0.0)
+        else:
+            shape, by_x = np.where(above, np.inf, -0.5 * np.log(2.0)), 0.0 * x
+        own = {c.name: c.S_max or b.S_max for c in b.channels}
+        values, slopes = [], []
+        for G in self.G:
+            L, dL = G * K, G * dK
+            D, dD = 1.0 + L.sum(axis=0), dL.sum(axis=1)
+            for place in self._places():
+                rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
+                N, dN = 1.0 + L[rest].sum(axis=0), dL[:, rest].sum(axis=1)
+                S, dS = np.log(np.abs(N / D)), (dN / N - dD / D).real.T
+                name = "actuator" if place is None else self._name(place)
+                values.append(S - np.log(own.get(name, b.S_max)))
+                slopes.append(np.column_stack([dS, 0.0 * x]))
+                if place == self.cascade.position:
+                    values.append(S - shape)
+                    slopes.append(np.column_stack([dS, by_x]))
+                    at = int(np.searchsorted(w, b.omega_low))
+                    values.append(S[at : at + 1] - np.log(b.S_low))
+                    slopes.append(np.append(dS[at], 0.0)[None])
+        if self.cascade.drive.number is Number.FIXED_30:
+            for value, slope in self._coefficients(kappa):
+                values.append(value)
+                slopes.append(slope)
+        for value, slope in self._filter_rows(kappa, log_band):
+            values.append(value)
+            slopes.append(slope)
+        c = np.concatenate(values) + self.options.room
+        good = np.isfinite(c)
+        return c[good], np.concatenate(slopes)[good]
+
+    def _filter_rows(self, kappa: Array, log_band: float) -> list[tuple[Array, Array]]:
+        """What filters may not do: raise their gain beyond `filter_gain`, or lie below ω_b, where
+        they would take the place of the PI."""
+        found, n = [], len(kappa)
+        if np.isfinite(self.cascade.filter_gain):
+            rise, steep = self.cascade.rises(np.exp(kappa), self.z)
+            by_kappa = steep.reshape(n, -1).T
+            value = (rise - np.log(self.cascade.filter_gain)).ravel()
+            found.append((value, np.column_stack([by_kappa, np.zeros(len(by_kappa))])))
+        places = np.flatnonzero(self.hertz)
+        slope = np.zeros((len(places), n + 1))
+        slope[np.arange(len(places)), places], slope[:, -1] = -1.0, 1.0
+        return [*found, (log_band - np.log(HZ) - kappa[places], slope)]
+
+    def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
+        """ln of the largest coefficient of each filter over what fixed point holds, by central
+        differences: it is a function of four numbers."""
+        h, at, found = self.options.difference, 3, []
+        blocks = self.cascade.filters
+        for slot, block in zip(self.cascade.slots, blocks, strict=True):
+            names = list(slot.settings)
+
+            def most(own: Array, block: Filter = block, names: list[str] = names) -> float:
+                values = dict(zip(names, np.exp(own).tolist(), strict=True))
+                b, a = block.coefficients(values)
+                return float(np.log(max(np.abs(b).max(), np.abs(a).max()) / block.largest_fixed))
+
+            own = kappa[at : at + len(names)]
+            slope = np.zeros((1, len(kappa) + 1))
+            for i, step in enumerate(h * np.eye(len(names))):
+                slope[0, at + i] = (most(own + step) - most(own - step)) / (2.0 * h)
+            found.append((np.array([most(own)]), slope))
+            at += len(names)
+        return found
+
+    def _places(self) -> list[int | None]:
+        """Sensors that count, and None for the actuator."""
+        used = {self.cascade.position, self.cascade.velocity}
+        return [*sorted(used)] if len(used) == 1 else [*sorted(used), None]
+
+    def _name(self, sensor: int) -> str:
+        return self.bounds.channels[sensor].name if self.bounds.channels else ""
+
+    def refine(self, values: Array) -> bool:
+        """Add to the grid where |S| peaks above its bounds between its points."""
+        coarse, T, o = self.omega, self.period, self.options
+        fine = np.exp(np.interp(
+            np.arange((len(coarse) - 1) * o.finer + 1) / o.finer, np.arange(len(coarse)),
+            np.log(coarse),
+        ))  # fmt: skip
+        K = self.cascade.responses(values, np.exp(1j * fine * T))[0]
+        new: list[float] = []
+        for system in self.systems:
+            L = system.swept(fine)[:, :, 0].T * K
+            for _, S, limit in self._figures(L):
+                cells = S[:-1].reshape(-1, o.finer)
+                ends = np.maximum(S[: -o.finer : o.finer], S[o.finer :: o.finer])
+                top = cells.max(axis=1)
+                high = (top > ends * (1.0 + o.missed)) & (top > limit * (1.0 - o.alert))
+                at = cells.argmax(axis=1) + o.finer * np.arange(len(cells))
+                new += fine[at[high]].tolist()
+        if not new:
+            return False
+        self.on(np.union1d(coarse, new))
+        return True
+
+    def judged(self, values: Array) -> tuple[float, float]:
+        """ω_b by the shape, and the largest ln of a peak over its bound, on the grid."""
+        K, b = self.cascade.responses(values, self.z)[0], self.bounds
+        bandwidth = np.inf
+        rise = self.cascade.rises(values, self.z)[0].max()
+        worst = float(rise - np.log(self.cascade.filter_gain))
+        for G in self.G:
+            for place, S, limit in self._figures(G * K):
+                worst = max(worst, float(np.log(S.max() / limit)))
+                if place == self.cascade.position:
+                    bandwidth = min(bandwidth, self._band(S))
+                    low = S[np.searchsorted(self.omega, b.omega_low)]
+                    worst = max(worst, float(np.log(low / b.S_low)))
+        return bandwidth, worst + self.options.room
+
+    def _band(self, S: Array) -> float:
+        """The largest ω_b that |S| on the grid allows."""
+        if self.bounds.shape is not None:
+            x = self.bounds.reached(np.sqrt(2.0) * S)
+            return float((self.omega / x).min())
+        over = np.flatnonzero(2.0 * S**2 > 1.0)
+        return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
+
+    def _figures(self, L: np.ndarray) -> list[tuple[int | None, Array, float]]:
+        """|S| at every place by its loops L (p, k), and its bound."""
+        D, b = np.abs(1.0 + L.sum(axis=0)), self.bounds
+        own = {c.name: c.S_max or b.S_max for c in b.channels}
+        found = []
+        for place in self._places():
+            rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
+            name = "actuator" if place is None else self._name(place)
+            S = np.abs(1.0 + L[rest].sum(axis=0)) / D
+            found.append((place, S, float(own.get(name, b.S_max))))
+        return found
