@@ -426,11 +426,14 @@ class VerdictRow:
         `passed`, `warned`, `failed` or `unknown`.
     words : str
         The result in a sentence.
+    details : tuple of str
+        What else is known, folded on a page.
     """
 
     name: str
     state: str
     words: str
+    details: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
-    return f"The controller has {order_words(run, found)}.{rest}"
+    return f"The deployed controller has {order_words(run, found)}.{rest}"
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:

@@ -55,7 +55,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
-        other = " (another: [move] in the case, or the options of robustness)"
+        other = "; set your own under [move]"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
@@ -216,19 +216,24 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     late = [m for m in made if np.isinf(m.settled)]
-    when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"
     if any(not m.finite for m in made):
         return f"{name}: the simulation was lost, so whether it settles is not known"
+    window, most_error = (with_unit(size, spoken("m")) for size in (made[0].window, peak))
+    words = f"{name}: the error is at most {most_error}"
     if late:
-        when = "does not settle" if any(m.rest > m.window for m in late) else (
-            f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"
-        )  # fmt: skip
-        when += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
-    words = f"{name}: {when}, error of at most {with_unit(peak, spoken('m'))}"
+        watched = with_unit(min(float(m.time[-1]) for m in late), "s")
+        stays = any(m.rest > m.window for m in late)
+        words += ", and does not settle" if stays else f", and has not settled within {watched}"
+        words += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
+    elif settled:
+        words += f", and within ±{window} from {with_unit(settled, 's')} on"
+    else:
+        words += f", always within ±{window}"
     held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
     if held > 0.5 * most:  # at the end of a move, as of a stage on springs
         words += f"; {with_unit(held, spoken('N'))} hold the stage there"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, after the figure's end {with_unit(float(after.max()), spoken('m'))}"
+    left = with_unit(float(after.max()), spoken("m"))
+    return f"{words} ({left} left where the figure ends)"

@@ -17,6 +17,7 @@ from ccd_casadi.reporting.decision import advice, lines_of, unproven, worst_stat
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped
+from ccd_casadi.support.text import counted
 from surrogates.files import write_whole
 
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
@@ -36,6 +37,21 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """
     lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
     return [wrapped(line, columns(sys.stdout)) for line in lines]
+
+
+def detail_lines(result: Mapping[str, Any]) -> list[str]:
+    """Write what the lines of the verdict rest on for the terminal, a row each.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    list of str
+    """
+    return [f"{line.name}: {words}" for line in lines_of(result) for words in line.details]
 
 
 def head_of(
@@ -87,7 +103,8 @@ def head_words(result: Mapping[str, Any]) -> str:
     if not warned and unproven(result) is not None:
         return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
-        return "all checks passed" + ("; the loop needs a look" if loop_concerns(result) else "")
+        count = len(loop_concerns(result))
+        return "all checks passed" + (f", with {counted(count, 'reservation')}" if count else "")
     return f"with warnings: {', '.join(warned)}"
 
 
