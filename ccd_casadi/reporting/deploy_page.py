@@ -65,14 +65,17 @@ def deploy_page(
         c.Chapter("Figures", _facts(run, found)),
     ]
     if found.sampled.stable:
-        chapters.append(c.Chapter("Step of the reference", (_step(run, found),)))
+        step = (_step(run, found),)
+        chapters.append(c.Chapter("Step of the reference", step, folded=True))
     if moved is not None:
         chapters.append(c.Chapter("A move on the machine", move_blocks(moved)))
     chapters += [
         c.Chapter("Sampling rate", _words("rate", found)),
-        c.Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
+        c.Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run)),
+                  folded=True),
         c.Chapter("As sections",
-                tuple(block for item in found.orders for block in _sections(item, run))),
+                  tuple(block for item in found.orders for block in _sections(item, run)),
+                  folded=True),
     ]  # fmt: skip
     if found.stable:
         chapters.append(c.Chapter("The code", _code(found)))

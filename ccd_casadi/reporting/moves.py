@@ -29,6 +29,7 @@ POINTS = 600
 STEPS = 200  # points of a force step
 DRAWN = 1200  # points of a curve of a move on the machine
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
+MASS_ERRORS = (-0.01, 0.01)  # relative, of what feedforward takes the mass for
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
     "settled after, ms": lambda m: 1e3 * m.settled,
@@ -42,9 +43,11 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
 }
 
 
-def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
+def move_blocks_of(
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView
+) -> tuple[c.Figure, c.Table]:
     """The case's move, or the default one of `robustness`, on all plants of a design, their rigid
-    bodies free: without and with feedforward."""
+    bodies free: without and with feedforward, and a table of plant by feedforward."""
     loops = view.loops
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
@@ -63,7 +66,33 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     mm = 1e3 * float(profile.at(np.array([end]))[0, 0])
     made = (mm, 1e3 * end, other, loops[0].sampling is not None, len(loops) > 1)
     words = paragraph("report.move", *made)
-    return ways_figure(dict(zip(ways, found, strict=True)), words)
+    rows = []
+    for name, each in zip(ways, found, strict=True):
+        rows.append((name, "the model", each[0]))
+        if len(each) > 1:
+            rows.append((name, "the worst of its set", max(each, key=lambda m: m.peak_error)))
+    if ahead is not None:
+        wrong = [(1.0 + off) * ahead for off in MASS_ERRORS]
+        tried = moves(loops[:1], wrong, profile, axis=0, window=window,
+                      bandwidth_hz=view.bandwidth_hz)  # fmt: skip
+        rows += [
+            (name, f"the model, feedforward {100.0 * off:+g} %", each[0])
+            for off, each in zip(MASS_ERRORS, tried, strict=True)
+        ]
+    made_ways = ways_figure(dict(zip(ways, found, strict=True)), words)
+    return made_ways, _move_table(rows)
+
+
+def _move_table(rows: Sequence[tuple[str, str, Move]]) -> c.Table:
+    """One error of one move for each feedforward and plant."""
+    unit, scale = display_unit(spoken("m"), max(move.peak_error for *_, move in rows))
+    window = with_unit(rows[0][2].window, spoken("m"))
+    head = ("feedforward", "plant", f"peak error ({unit})", f"within ±{window} from (ms)",
+            spoken("peak force (N)"))  # fmt: skip
+    return c.Table(head, tuple(
+        (way, plant, scale * move.peak_error, 1e3 * move.settled, float(move.peak_force.max()))
+        for way, plant, move in rows
+    ))  # fmt: skip
 
 
 def cycle_chapter(

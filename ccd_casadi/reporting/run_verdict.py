@@ -67,7 +67,8 @@ def head_of(
     badge = "bad" if not good else "good" if clean else "warn"
     own = bool(decision)
     decision = decision or advice(result)
-    return Head(title, badge, status, reason, meta, lead, lines_of(result), decision, own)
+    lines = lines_of(result)
+    return Head(title, badge, status, reason, meta, lead, lines, decision, own, folded=True)
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
@@ -79,7 +80,7 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
     reason = head_words(result) if good else why
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
     status = STATUS.get(result["status"], "not verified")
-    return head_of(title, good, status, reason, meta, lead, result)
+    return replace(head_of(title, good, status, reason, meta, lead, result), folded=False)
 
 
 def head_words(result: Mapping[str, Any]) -> str:

@@ -1,9 +1,13 @@
 """The pages of a run in a real browser: quiet, readable narrow and dark, whole in print, linked."""
 
+import csv
+import io
 import json
 import re
 import shutil
 from io import BytesIO
+from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from oracles.chromium import chromium
@@ -69,6 +73,13 @@ CONTRAST = r"""() => {
 }"""
 
 
+OPEN = "document.querySelectorAll('.folded').forEach(one => one.open = true)"
+# what is folded and has no height
+HIDDEN = """() => [...document.querySelectorAll(".folded > :not(summary)")]
+  .filter(one => !one.getClientRects().length || !one.getBoundingClientRect().height)
+  .map(one => one.textContent.slice(0, 40))"""
+
+
 @pytest.fixture(scope="module")
 def one_browser():
     """For all tests here, which need no other event loop: to start one takes a second."""
@@ -100,6 +111,10 @@ def looked_at(browser, pages, schemes=SCHEMES):
         heard = complaints(page)
         for place in pages:
             page.goto(place.as_uri())
+            page.emulate_media(media="print")
+            assert page.evaluate(HIDDEN) == [], place  # printed pages show what is folded
+            page.emulate_media(media="screen")
+            page.evaluate(OPEN)
             for width in WIDTHS:
                 page.set_viewport_size({"width": width, "height": 900})
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, place
@@ -119,6 +134,26 @@ def looked_at(browser, pages, schemes=SCHEMES):
             page.emulate_media(media="screen")
         assert not heard
         context.close()
+
+
+def test_a_figure_is_saved_as_a_picture_and_as_numbers(browser, solved):
+    """All points as drawn: |S| of the page is that of result.json at its largest."""
+    folder = solved("lifted")
+    page = browser.new_page()
+    page.goto((folder / "report.html").as_uri())
+    figure = page.locator("figure").first
+    saved = {}
+    for kind in ("SVG", "CSV"):
+        with page.expect_download() as waited:
+            figure.get_by_role("button", name=f"Save this figure as {kind}").click()
+        saved[kind] = Path(waited.value.path()).read_text("utf-8")
+        assert waited.value.suggested_filename == f"at-a-glance-1.{kind.lower()}"
+    assert ElementTree.fromstring(saved["SVG"]).findall(".//{http://www.w3.org/2000/svg}path")
+    head, *rows = csv.reader(io.StringIO(saved["CSV"]))
+    assert head == ["x axis", "y axis", "curve", "x", "y"]
+    peak = max(float(row[4]) for row in rows if row[1].startswith("|S|"))
+    result = json.loads((folder / "result.json").read_text())
+    assert peak == pytest.approx(result["sensitivity_peak"], rel=0.01)  # as far as it is drawn
 
 
 def name_of(place):
@@ -142,6 +177,7 @@ def test_the_pages_of_a_run_are_read_on_any_screen_and_on_paper(browser, solved)
 def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     place = page.locator("svg[aria-label='At a glance: |S| (–)']")
     place.scroll_into_view_if_needed()
     place.hover()
@@ -168,6 +204,7 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
 def test_the_cursor_of_a_nyquist_plot_reads_its_frequency(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator("svg[aria-label='At a glance: Im L (–)']")
     plot.scroll_into_view_if_needed()
     d = json.loads(plot.get_attribute("data-axes"))
@@ -192,6 +229,7 @@ def test_a_part_of_a_figure_is_enlarged_and_the_whole_shown_again(browser, solve
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     heard = complaints(page)
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator("svg[aria-label='At a glance: |S| (–)']")
     plot.scroll_into_view_if_needed()
     box, before = plot.bounding_box(), plot.screenshot()
@@ -221,6 +259,7 @@ def test_a_part_of_a_map_is_enlarged(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     heard = complaints(page)
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator(".whole svg[aria-label^=Landscape]")
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()
