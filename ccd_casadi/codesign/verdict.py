@@ -229,7 +229,8 @@ def _sides(kink: Kink) -> list[str]:
     where = "both sides" if known == len(found) else f"the {known} known sides of {len(found)}"
     of = f" of {counted(len(kink.slopes), 'direction')}" if len(kink.slopes) > 1 else ""
     least = f"the least slope there is {kink.least_slope:.2g} of the gradient"
-    return [f"{'rises' if kink.least_slope > 0.0 else 'does not fall'} on {where}{of}", least]
+    rises = "rises" if kink.least_slope > 0.0 else "rises or stays"
+    return [f"{rises} on {where}{of}", least]
 
 
 def search_evidence(
@@ -245,9 +246,11 @@ def search_evidence(
     counted_up = ("points", "fresh", "feasible", "better", "starts", "seed")
     figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
     figures["objective_before"] = look.before
-    how = f"{look.fresh} other theta of the box"
-    if look.points > look.fresh:
-        how += f" and {look.points - look.fresh} of the run"
+    own = look.points - look.fresh
+    how = " and ".join(
+        [f"{look.fresh} other theta of the box"] * bool(look.fresh or not own)
+        + [f"{own} of the run"] * bool(own)
+    )
     if look.moved:
         moved = f"moved by the global check: the formulation ended at J = {look.before:.6g}"
         return (known, moved, f"checked at {how}", gap), figures

@@ -38,6 +38,8 @@ GROUPS = {"synthesis": ("search", "certificate"), "loops": ("rows", "curvature")
 PARTS = tuple(part for parts in GROUPS.values() for part in parts)
 SECONDS = {"synthesis": 37.0, "loops": 23.0}  # of one core, as measured
 LOOPS = ("loop_grid", "loop_point", "modes", "sections")  # modules of that group
+# Of both groups, and all that `check` needs: a few seconds, compiled where they are called.
+SHARED = ("frequency", "linear_algebra")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
 
 
@@ -112,8 +114,9 @@ def _compile_rows(curvature: bool) -> None:
 
 
 def group_of(module: str) -> str:
-    """The group of a kernel, by the name of its module."""
-    return "loops" if module.rpartition(".")[2] in LOOPS else "synthesis"
+    """The group of a kernel, by the name of its module; empty of a shared one."""
+    name = module.rpartition(".")[2]
+    return "" if name in SHARED else "loops" if name in LOOPS else "synthesis"
 
 
 def is_compiled(group: str) -> bool:
@@ -140,7 +143,7 @@ def ensure_compiled(*groups: str) -> None:
         parts = tuple(part for group in missing for part in GROUPS[group])
         count, seconds = min(len(parts), usable_cores()), sum(SECONDS[group] for group in missing)
         kernels = {name: kernel for name, kernel in kernels.items()
-                   if group_of(name.rpartition(".")[0]) in missing}  # fmt: skip
+                   if group_of(name.rpartition(".")[0]) in ("", *missing)}  # fmt: skip
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
             f" about {seconds / count:.0f} s on {count} core{'s' if count > 1 else ''}"

@@ -29,7 +29,7 @@ class _FirstCompilation(event.Listener):
             return
         compilation = import_module(f"{PACKAGE}.compilation")  # which itself imports the kernels
         group = compilation.group_of(module)
-        if group not in self.seen:
+        if group and group not in self.seen:
             self.seen.add(group)
             compilation.ensure_compiled(group)
 

@@ -255,9 +255,9 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
         words += ", and does not settle" if stays else f", and has not settled within {watched}"
         words += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
     elif settled:
-        words += f", and within ±{window} from {with_unit(settled, 's')} on"
+        words += f", and within +-{window} from {with_unit(settled, 's')} on"
     else:
-        words += f", always within ±{window}"
+        words += f", always within +-{window}"
     held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
     if held > 0.5 * most:  # at the end of a move, as of a stage on springs
         words += f"; {with_unit(held, spoken('N'))} hold the stage there"

@@ -114,7 +114,7 @@ def test_a_job_compiles_the_group_that_it_needs_and_the_other_when_that_is_neede
 def test_the_parts_of_a_group_call_every_kernel_of_its_modules() -> None:
     """And none of the other group, which would be compiled twice."""
     groups = {compilation.group_of(name.rpartition(".")[0]) for name in compilation._kernels()}
-    assert groups == set(compilation.GROUPS)
+    assert groups == {*compilation.GROUPS, ""}
     assert {f"ccd_casadi.kernels.{name}" for name in compilation.LOOPS} <= {
         name.rpartition(".")[0] for name in compilation._kernels()
     }
