@@ -80,6 +80,30 @@ HIDDEN = """() => [...document.querySelectorAll(".folded > :not(summary)")]
   .map(one => one.textContent.slice(0, 40))"""
 
 
+# What a reader with a keyboard or a screen reader misses: names, headings, where to scroll.
+ACCESS = r"""() => {
+  const name = one =>
+    one.getAttribute("aria-label") || one.labels?.[0]?.textContent || one.textContent
+  const found = [], all = what => [...document.querySelectorAll(what)]
+  for (const one of all("svg[role=img], button, a, input, summary, nav"))
+    if (!name(one).trim()) found.push(`no name: ${one.outerHTML.slice(0, 60)}`)
+  for (const svg of all("figure svg"))
+    if (svg.getAttribute("role") !== "img" && !svg.closest("svg svg"))
+      found.push("a figure without role")
+  const navs = all("nav").map(name)
+  if (new Set(navs).size < navs.length) found.push("two landmarks of one name")
+  for (const th of all("th")) if (!th.textContent.trim()) found.push("an empty header")
+  for (const one of all("div"))
+    if (one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).overflowX === "auto" &&
+        one.tabIndex < 0 && !one.querySelector("[tabindex='0'], a, button"))
+      found.push(`scrolls without focus: ${one.className}`)
+  const levels = all("h1, h2, h3").map(one => +one.tagName[1])
+  if (levels[0] !== 1 || levels.some((level, i) => i && level > levels[i - 1] + 1))
+    found.push(`headings ${levels}`)
+  return found
+}"""
+
+
 @pytest.fixture(scope="module")
 def one_browser():
     """For all tests here, which need no other event loop: to start one takes a second."""
@@ -120,6 +144,7 @@ def looked_at(browser, pages, schemes=SCHEMES):
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, place
                 assert page.evaluate(SPLIT) == [], (place, width)
                 assert page.evaluate(LABELS) == [], (place, width)
+                assert page.evaluate(ACCESS) == [], (place, width)
                 picture(page, f"{name_of(place)}_{width}_{scheme}", whole=True)
             found = page.evaluate(CONTRAST)
             if page.locator("svg text").count():
@@ -303,6 +328,17 @@ def test_words_outside_and_on_each_other_are_noticed(browser):
 
 
 @pytest.mark.slow
+def test_what_is_not_accessible_is_noticed(browser):
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.set_content(
+        "<h2>first</h2><nav>a</nav><nav>a</nav><table><tr><th></th></tr></table><button></button>"
+        "<div style='overflow-x: auto; width: 90px'><p style='width: 500px'>wide</p></div>"
+    )
+    found = " ".join(page.evaluate(ACCESS))
+    for words in ("no name", "two landmarks", "empty header", "without focus", "headings 2"):
+        assert words in found
+
+
 def test_every_page_of_a_run(browser, solved, tmp_path):
     folder = shutil.copytree(
         solved("lifted"), tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")
