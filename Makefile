@@ -81,12 +81,13 @@ peers: setup-test
 setup: $(VENV)/.ready
 setup-test: $(VENV)/.ready-test
 
-# The kernels are compiled once here, so that the first solve does not wait for them; what they need
-# is installed first, as bytecode only where it is imported, the other wheels meanwhile.
+# The kernels that `make solve` needs are compiled once here, so that it does not wait for them (the
+# others by the first job that needs them); what they need is installed first, as bytecode only where
+# it is imported, the other wheels meanwhile.
 $(VENV)/.ready: requirements.lock pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(PIP) --no-compile -c requirements.lock numba scipy
-	$(BIN)/python -c "from ccd_casadi.kernels import compilation; compilation.ensure_compiled()" & \
+	$(BIN)/python -c "from ccd_casadi.kernels import compilation; compilation.ensure_compiled('synthesis')" & \
 	kernels=$$!; \
 	$(PIP) -r requirements.lock && \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e . \

@@ -32,7 +32,7 @@ def summary(solution: "Solution") -> str:
         requirement_lines,
         theta_words,
     )
-    from ccd_casadi.reporting.run_verdict import terminal_lines
+    from ccd_casadi.reporting.run_verdict import detail_lines, terminal_lines
     from ccd_casadi.support.text import template
 
     r = solution.result
@@ -41,8 +41,8 @@ def summary(solution: "Solution") -> str:
         return words.render(r=r).rstrip()
     found = r.get("controller", {}).get("sections", ())
     return words.render(
-        r=r, decision=advice(r), verdict=terminal_lines(r), theta=theta_words(r),
-        hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
+        r=r, decision=advice(r), verdict=terminal_lines(r), details=detail_lines(r),
+        theta=theta_words(r), hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
         sections=[SectionWords(**item) for item in found],
         loop_lines=loop_lines(r), required=requirement_lines(r),
         design_plant=design_plant_lines(r.get("robust") or {}),

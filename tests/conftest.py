@@ -71,6 +71,23 @@ def pictures(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def short_verdicts() -> Iterator[None]:
+    """Every line of a verdict that any test makes has 25 words at most, and none had to be cut."""
+    from ccd_casadi.codesign.verdict import VerdictLine
+
+    made = VerdictLine.__init__
+
+    def checked(self: VerdictLine, *args: Any, **named: Any) -> None:
+        made(self, *args, **named)
+        long = [one for one in self.clauses if len(one.split()) > 25 or one.endswith(" ...")]
+        assert not long, long
+
+    VerdictLine.__init__ = checked  # type: ignore[method-assign]
+    yield
+    VerdictLine.__init__ = made  # type: ignore[method-assign]
+
+
 @pytest.fixture(scope="session")
 def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
     """A folder by name for all processes of pytest-xdist, in a `with` that one enters at a time."""

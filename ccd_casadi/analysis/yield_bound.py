@@ -58,8 +58,8 @@ class Yield:
         """With the share rounded down."""
         percent = int(1e4 * self.least) / 100.0
         return (
-            f"{self.survived} of {self.draws} fresh random plants survive: at least {percent:g} % "
-            f"of all, at confidence {YieldOptions().words}"
+            f"{self.survived} of {self.draws} random plants survive, and so do at least "
+            f"{percent:g} % of all (confidence {YieldOptions().words})"
         )
 
     @property

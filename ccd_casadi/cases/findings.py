@@ -131,10 +131,9 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
 def _dip(zero: Zero, place: str) -> Finding:
     z = zero.frequency_hz
     words = (
-        f"a transmission zero at {z:.4g} Hz {place}, damping {100 * zero.damping_ratio:.2g} %: the "
-        f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
-        f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
-        "Hz unless M_K allows that force"
+        f"an anti-resonance (transmission zero) at {z:.4g} Hz {place}, damping "
+        f"{100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through it needs "
+        f"{1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
     )
     return Finding(Severity.NOTE, Topic.ZERO, words)
 
@@ -376,7 +375,7 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
         against = f"M_K suits {suits:.3g} Hz"
         if is_force(problem.spoken[1]):  # of a voltage 1/(b²) is not a mass
             moved = spoken(f"{facts.inertia:.3g} kg")
-            against += f" for the {moved} that an actuator moves{of_newtons(problem.spoken[1])}"
+            against += f" for the {moved} that an actuator feels{of_newtons(problem.spoken[1])}"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:

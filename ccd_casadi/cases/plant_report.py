@@ -117,8 +117,8 @@ def size_words(
     """
     parts = []
     if math.isfinite(facts.inertia) and is_force(case.units.input):
-        moved = spoken(f"an actuator moves {facts.inertia:.3g} kg")
-        parts.append(moved + of_newtons(case.units.input))
+        felt = spoken(f"the mass felt by an actuator is {facts.inertia:.3g} kg")
+        parts.append(felt + of_newtons(case.units.input))
     flexible = [mode.frequency_hz for mode in facts.modes if mode.resonant]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):

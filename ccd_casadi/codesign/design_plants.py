@@ -167,4 +167,4 @@ def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
             narrower += f" ({held} was held on the way)"
         ways.append(narrower)
     ways.append("another kind of controller (`robustness --controller` judges any)")
-    return f"that none exists is not proven; try {', '.join(ways[:-1])}, or {ways[-1]}"
+    return f"one may exist all the same; try {', '.join(ways[:-1])}, or {ways[-1]}"

@@ -184,17 +184,17 @@ class OtherDamping:
     def words(self) -> str:
         """What passes a bound by more than a hundredth with the other damping only, or nothing."""
         other = "matrix" if self.kept == "ratio" else "ratio"
-        where = f"on the set if the damping {other} is kept and not the {self.kept}"
+        where = f"on the set with the damping {other} kept instead of the {self.kept}"
         if not self.own:
             return ""
         if not self.other:
             return f"a loop is unstable {where}"
         found = [
-            f"{'S' if name == 'S_max' else name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
+            f"{'S' if name == 'S_max' else name} by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
             if share - max(1.0, self.own[name]) > RobustCheckOptions().exceeded
         ]
-        return f"{', '.join(found)} {where}" if found else ""
+        return f"bounds are exceeded {where}: {', '.join(found)}" if found else ""
 
     @property
     def entry(self) -> dict[str, Any]:

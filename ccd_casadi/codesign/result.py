@@ -25,6 +25,7 @@ from ccd_casadi.codesign.result_entries import budget_entry, iso_entry, move_ent
 from ccd_casadi.codesign.verdict import (
     State,
     VerdictLine,
+    clauses_of,
     confirmed,
     deployable,
     optimal,
@@ -152,8 +153,9 @@ def of_budget(
     result, words = {**solution.result, **own}, spent.words
     if words and "verdict" in result:
         line = result["verdict"]["optimal"]
-        said = {"state": State.UNKNOWN.value, "words": f"{words}; {line['words']}"}
-        verdict = result["verdict"] = {**result["verdict"], "optimal": {**line, **said}}
+        figures = {key: v for key, v in line.items() if key not in ("state", "words", "details")}
+        own_line = VerdictLine.of(State.UNKNOWN, (*words.split("; "), *clauses_of(line)), figures)
+        verdict = result["verdict"] = {**result["verdict"], "optimal": own_line.entry}
         unknown = dict.fromkeys(("inner_optimum", "optimality"))
         checks = result["checks"] = {**result["checks"], **unknown}
         lost = any(one["state"] == State.FAILED.value for one in verdict.values())

@@ -395,6 +395,13 @@ def sections_controller(design: WithSections, sampling: Sampling | None) -> dict
     return controller_dict(design.controller) | {"sections": words}
 
 
+PROVEN = {
+    OwnSet.KEPT: "proven",
+    OwnSet.UNPROVEN: "not every bound is proven",
+    OwnSet.SEARCHED: "searched, not proven",
+}
+
+
 def box_words(
     wide: SetCertificate, checked: int, proof: "Proof", worst: Excess, drawn: Yield | None,
     *, along: bool,
@@ -419,7 +426,7 @@ def box_words(
     dict
         `own`, `own_words` and `figures`.
     """
-    excess, fresh = math.expm1(worst.value), "" if drawn is None else drawn.words
+    excess, fresh = math.expm1(worst.value), () if drawn is None else (drawn.words,)
     figures = {
         "plants": checked,
         "worst_excess": excess,
@@ -427,24 +434,27 @@ def box_words(
         "proven": proof.levels,
         "unproven": proof.unasked,
     }
-    where = f"{counted(checked, 'plant')} of the box that [robust] names"
-    share, within = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(worst)
-    own, words = OwnSet.BROKEN, f"{within} on {where}, the worst that a search found at {share}"
+    tried = f"{counted(checked, 'plant')} of the [robust] set"
+    found = f"worst plant that a search found: {100.0 + 100.0 * excess:.6g} % of a bound"
+    within = kept_words(worst)
+    own = OwnSet.BROKEN
+    clauses: tuple[str, ...] = (f"{within} on {tried}", found)
     if not wide.passed:
-        words = f"on {where}: {wide.words}"
+        clauses = (wide.words, f"on {tried}")
     elif proof.denies:
-        words = f"{within} on {where}, but {proof.words}"
+        clauses = (*proof.clauses, *clauses)
     elif checked <= 1:
-        own, words = OwnSet.NONE, "[robust] names no plant but the model"
+        own, clauses = OwnSet.NONE, ("judged on the model alone: [robust] names no plant",)
     elif drawn is not None and drawn.survived < drawn.draws:
-        words = f"{within} on {where}, but of the whole box {fresh}"
+        clauses = (*fresh, *clauses)
     elif along:
         own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
         own = OwnSet.UNPROVEN if proof.unclosed else own
-        words = "; ".join(part for part in (words, fresh, proof.words) if part)
+        clauses = (f"{within} on the [robust] set: {PROVEN[own]}", *proof.clauses,
+                   f"judged on {tried}", found, *fresh)  # fmt: skip
     else:
-        words = f"{within} on {where}, but not all along its common resonance shift"
-    return {"own": own, "own_words": words, "figures": figures}
+        clauses = ("the [robust] set is not kept all along its common resonance shift", *clauses)
+    return {"own": own, "own_words": clauses, "figures": figures}
 
 
 @dataclass(frozen=True)

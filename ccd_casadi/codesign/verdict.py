@@ -10,10 +10,10 @@ checked is unknown and never passed.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
@@ -43,6 +43,8 @@ class VerdictOptions:
         Of its size: what a constraint may be exceeded by at an optimum.
     sigmas, left_out : float
         Left-out error at the design, in predicted deviations and relative, up to which it passes.
+    most_words : int
+        Of a line's sentence; what else is known follows as details.
     """
 
     saddle: float = -1e-3
@@ -52,6 +54,7 @@ class VerdictOptions:
     primal: float = 1e-6
     sigmas: float = 3.0
     left_out: float = 0.01
+    most_words: int = 25
 
 
 class State(StrEnum):
@@ -94,29 +97,67 @@ class VerdictLine:
     state : State
         Passed, warned, failed or unknown.
     words : str
-        Why, in one sentence.
+        Why, in one sentence of at most `most_words`.
     figures : mapping
         On which it rests, by keys of result.json.
+    details : tuple of str
+        What else is known, a clause each.
     """
 
     state: State
     words: str
     figures: Mapping[str, Any]
+    details: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, state: State, clauses: Iterable[str], figures: Mapping[str, Any]) -> Self:
+        """A line of clauses in the order of their importance (`split`)."""
+        words, details = split(clauses)
+        return cls(state, words, figures, details)
+
+    @property
+    def clauses(self) -> tuple[str, ...]:
+        """The sentence and the details."""
+        return (self.words, *self.details)
 
     @property
     def entry(self) -> dict[str, Any]:
         """Of `verdict` in result.json."""
-        return {"state": self.state.value, "words": self.words, **self.figures}
+        said = {"words": self.words, "details": list(self.details)}
+        return {"state": self.state.value, **said, **self.figures}
+
+
+def split(
+    clauses: Iterable[str], options: VerdictOptions = VerdictOptions()
+) -> tuple[str, tuple[str, ...]]:
+    """As many clauses as `most_words` hold as a sentence, and the others. Empty ones are left out;
+    a first one that is longer is cut, and whole among the others."""
+    given = [clause for clause in clauses if clause]
+    held, count = 0, 0
+    for clause in given:
+        held += len(clause.split())
+        if held > options.most_words:
+            break
+        count += 1
+    words = "; ".join(given[:count])
+    if given and not count:
+        words = f"{' '.join(given[0].split()[: options.most_words - 1])} ..."
+    return words, tuple(given[count:])
+
+
+def clauses_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """The clauses of a line as result.json has it; none of an empty entry."""
+    return (str(entry.get("words", "")), *map(str, entry.get("details", ())))
 
 
 def confirmed(line: VerdictLine, second: EngineComparison) -> VerdictLine:
     """`certified` with what a second engine says of the same loops."""
-    state, words = line.state, f"{line.words}; {second.words}"
+    state, clauses = line.state, (*line.clauses, second.words)
     if second.agrees is False:
-        state, words = State.FAILED, f"{line.words}, but {second.words}"
+        state, clauses = State.FAILED, (second.words, *line.clauses)
     elif second.agrees is None and state is State.PASSED:
-        state, words = State.WARNED, f"{line.words}; not confirmed: {second.words}"
-    return VerdictLine(state, words, {**line.figures, "second_engine": second.entry})
+        state, clauses = State.WARNED, (f"not confirmed: {second.words}", *line.clauses)
+    return VerdictLine.of(state, clauses, {**line.figures, "second_engine": second.entry})
 
 
 def optimal(
@@ -126,7 +167,7 @@ def optimal(
     gap: float,
     tolerance: float,
     better: str,
-    searched: tuple[str, Mapping[str, Any]],
+    searched: tuple[Sequence[str], Mapping[str, Any]],
     unknown: str = "",
     saddle: float | None = None,
     options: VerdictOptions = VerdictOptions(),
@@ -140,78 +181,80 @@ def optimal(
     residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
     figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
     if gap > tolerance:
-        return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
+        return VerdictLine.of(State.FAILED, (f"not optimal: {better}", *known), figures)
     if not kkt.primal <= options.primal:
         words = f"not optimal: a constraint or bound of theta is exceeded by {kkt.primal:.2g}"
-        return VerdictLine(State.FAILED, f"{words}; {known}", figures | {"primal": kkt.primal})
+        return VerdictLine.of(State.FAILED, (words, *known), figures | {"primal": kkt.primal})
     if not math.isfinite(gap):
-        known = f"the search at this theta that was to challenge it found nothing; {known}"
+        known = ("the search at this theta that was to challenge it found nothing", *known)
     sound = State.PASSED if math.isfinite(gap) else State.WARNED
     if unknown and not math.isfinite(residual):
-        return VerdictLine(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
+        words = f"{unknown}: a limit of the program"
+        return VerdictLine.of(State.WARNED, (words, *known), figures)
     if not residual <= level:
-        words = f"not optimal: KKT residual {residual:.3g} over theta, above {level:g}; {known}"
-        return VerdictLine(State.FAILED, words, figures)
+        words = f"not optimal: KKT residual {residual:.3g} over theta, above {level:g}"
+        return VerdictLine.of(State.FAILED, (words, *known), figures)
     if kink is None:
-        words = f"locally optimal, KKT residual {residual:.2g} over theta; {known}"
+        stationary = f"KKT residual {residual:.2g} over theta"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
-            words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
-            return VerdictLine(State.WARNED, words, figures)
-        return VerdictLine(sound, words, figures)
+            words = f"a stationary point, but J curves downwards there ({kkt.second_order:.2g})"
+            return VerdictLine.of(State.WARNED, (words, *known, stationary), figures)
+        best = f"locally optimal: {known[0]}"
+        return VerdictLine.of(sound, (best, *known[1:], stationary), figures)
     figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
     if kink.least_slope < -level:
-        words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
-        return VerdictLine(State.FAILED, f"{words}; {known}", figures)
-    beside = f"J by climbs of its controller, {KktOptions.step:g} of the box away,"
-    words = (
-        f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
-        f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
-        f"{beside if kink.first_order else 'true J'} "
-        f"{_sides(kink)}; {known}"
+        words = "not optimal: J has a kink and falls on a side of it"
+        return VerdictLine.of(State.FAILED, (words, *_sides(kink)[1:], *known), figures)
+    beside, *rest = _sides(kink)
+    if kink.first_order and kink.slopes:
+        rest.append(f"by climbs of its controller, {KktOptions.step:g} of the box away")
+    rest.append(
+        f"KKT residual {residual:.2g} over theta and the controller together "
+        f"({kink.one_gradient:.2g} by the gradient of one side)"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
-    return VerdictLine(sound if known_all else State.WARNED, words, figures)
+    clauses = (f"locally optimal to first order at a kink: J {beside}", *known, *rest)
+    return VerdictLine.of(sound if known_all else State.WARNED, clauses, figures)
 
 
-def _sides(kink: Kink) -> str:
-    """What true values beside a kink say, in words."""
+def _sides(kink: Kink) -> list[str]:
+    """What values beside a kink say, and by how much."""
     if not kink.slopes:
-        return "was not evaluated beside it: bounds alone hold theta"
+        return ["was not evaluated beside it: bounds alone hold theta"]
     found = [slope for pair in kink.slopes for slope in pair]
     known = sum(map(math.isfinite, found))
     if not known:
-        return "is not known beside it"
-    if len(found) == 2 and known == 2:
-        words = f"{found[0]:.2g} and {found[1]:.2g} times its gradient"
-        return f"rises on both sides of the direction that no bound holds ({words})"
+        return ["is not known beside it"]
     where = "both sides" if known == len(found) else f"the {known} known sides of {len(found)}"
-    return (
-        f"rises on {where} of {counted(len(kink.slopes), 'direction')}, by at least "
-        f"{kink.least_slope:.2g} of its gradient"
-    )
+    of = f" of {counted(len(kink.slopes), 'direction')}" if len(kink.slopes) > 1 else ""
+    least = f"the least slope there is {kink.least_slope:.2g} of the gradient"
+    rises = "rises" if kink.least_slope > 0.0 else "rises or stays"
+    return [f"{rises} on {where}{of}", least]
 
 
 def search_evidence(
     starts: int, optima: int, look: GlobalCheck | None, gap: str = "gap not known"
-) -> tuple[str, dict[str, Any]]:
-    """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """What IPOPT's starts, the global check over the box and bounds say, in clauses and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     known = f"best of {counted(starts, 'start')}" if starts else "from one start"
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        return f"{known}, no global check over the box, {gap}", figures
+        return (f"{known}, no global check over the box", gap), figures
     counted_up = ("points", "fresh", "feasible", "better", "starts", "seed")
     figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
     figures["objective_before"] = look.before
-    how = f"{look.fresh} fresh spread theta"
-    if look.points > look.fresh:
-        how += f" and {look.points - look.fresh} that the run had solved"
-    said = f"none better at {how}"
+    own = look.points - look.fresh
+    how = " and ".join(
+        [f"{look.fresh} other theta of the box"] * bool(look.fresh or not own)
+        + [f"{own} of the run"] * bool(own)
+    )
     if look.moved:
-        said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
-    return f"{known}, {said}, {gap}", figures
+        moved = f"moved by the global check: the formulation ended at J = {look.before:.6g}"
+        return (known, moved, f"checked at {how}", gap), figures
+    return (f"{known}, none better at {how}", gap), figures
 
 
 def predicted(
@@ -228,7 +271,7 @@ def predicted(
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if quality is None:
         words = "nothing was predicted: the search used true values"
-        return VerdictLine(State.UNKNOWN, f"not applicable: {words}", figures)
+        return VerdictLine.of(State.UNKNOWN, (f"not applicable: {words}",), figures)
     left_out = quality.at_point
     if left_out is not None:
         size, sigmas = abs(left_out[0]), left_out[1]
@@ -239,23 +282,21 @@ def predicted(
             f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
         )
         if learnt and math.isfinite(error):
-            words += "; since then the surrogate has the design among its samples"
-            return VerdictLine(State.WARNED, words, figures | {"learnt": True})
-        return VerdictLine(State.FAILED, words, figures)
+            learnt_words = "the surrogate has learnt the design since"
+            return VerdictLine.of(State.WARNED, (words, learnt_words), figures | {"learnt": True})
+        return VerdictLine.of(State.FAILED, (words,), figures)
     if left_out is None:
         words = f"{what} predicted, error {small_share(error)}"
         if quality.extrapolates:
-            words += f"; the surrogate extrapolates there: {quality.extrapolates[0]}"
-            return VerdictLine(State.WARNED, words, figures)
-        return VerdictLine(State.PASSED, words, figures)
-    words = (
-        f"the optimum is a training sample; left out, its {what} is missed by "
-        f"{size:.2g} {unit} ({100 * share:.2g} %, {sigmas:.1f} sigma)"
-    )
+            beyond = f"the surrogate extrapolates there: {quality.extrapolates[0]}"
+            return VerdictLine.of(State.WARNED, (words, beyond), figures)
+        return VerdictLine.of(State.PASSED, (words,), figures)
+    missed = f"{size:.2g} {unit} ({100 * share:.2g} %, {sigmas:.1f} sigma)"
+    words = f"the surrogate without this design misses its {what} by {missed}"
+    computed = f"the {what} itself is computed, not predicted"
     if share <= tolerance or (sigmas <= options.sigmas and share <= options.left_out):
-        return VerdictLine(State.PASSED, words, figures)
-    words += ": the samples around do not support the design"
-    return VerdictLine(State.WARNED, words, figures)
+        return VerdictLine.of(State.PASSED, (words, computed), figures)
+    return VerdictLine.of(State.WARNED, (f"{words}: do not use it here", computed), figures)
 
 
 def survives(
@@ -263,7 +304,7 @@ def survives(
     *,
     S_max: float,
     own: OwnSet | None = None,
-    own_words: str = "",
+    own_words: Sequence[str] = (),
     other_damping: str = "",
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
@@ -277,8 +318,9 @@ def survives(
         The ranges of the loop; None where it is not certified.
     S_max : float
         Bound of ‖S‖∞.
-    own, own_words : OwnSet or None, str
-        What is known of the loop on the case's own set, and why; None: its kind has no set.
+    own, own_words : OwnSet or None, sequence of str
+        What is known of the loop on the case's own set, and why, in clauses; None: its kind has no
+        set.
     other_damping : str
         What that set does not keep, in words.
     closer : sequence of (name, stable, peak)
@@ -296,24 +338,22 @@ def survives(
     figures = {**(figures or {}), **({} if own is None else {"set": own.value})}
     if survival is None:
         if own is OwnSet.BROKEN:
-            return VerdictLine(State.FAILED, own_words, figures)
-        return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures)
+            return VerdictLine.of(State.FAILED, own_words, figures)
+        return VerdictLine.of(State.UNKNOWN, ("the loop could not be perturbed",), figures)
     (low, high), damping = survival.stable_shift, survival.stable_damping
     failed, warned = own is OwnSet.BROKEN, own in (OwnSet.UNPROVEN, OwnSet.NONE)
-    said = [words for words in (survival.contradiction, own_words, other_damping) if words]
-    said.append(f"stable for resonances {_range(low, high)}")
+    said = [survival.contradiction, *own_words[:1], f"stable for resonances {_range(low, high)}"]
     if not (low <= -options.least_shift and high >= options.least_shift):
         warned = True
-        said[-1] += f", less than +-{100 * options.least_shift:g} %"
-    more = "" if survival.S_max_slack < STATED else f"{1.0 + survival.S_max_slack:.6g} "
-    said.append(f"within {more}S_max {_range(*survival.S_max_shift)}")
+        said[-1] += f", and +-{100 * options.least_shift:g} % is the least to accept"
     if not (damping[0] <= options.least_factors[0] and damping[1] >= options.least_factors[1]):
         warned = True
-        said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
+        between = f"between {damping[0]:.3g} and {damping[1]:.3g} times the model's"
+        said.append(f"unstable where damping is not {between}")
     if survival.unstable_poles_hz:
         warned = True
         at = ", ".join(f"{hz:.4g}" for hz in survival.unstable_poles_hz[:3])
-        said.append(f"K itself is unstable (poles at {at} Hz)")
+        said.append(f"the controller by itself is unstable (poles at {at} Hz)")
     for name, stable, peak in closer:
         if not stable:
             failed = True
@@ -321,17 +361,20 @@ def survives(
         elif not peak <= (1.0 + options.closer_peak) * S_max:
             warned = True
             said.append(f"peak of S {peak:.3g} on {name}")
+    more = "" if survival.S_max_slack < STATED else f"{1.0 + survival.S_max_slack:.6g} "
+    said.append(f"within {more}S_max {_range(*survival.S_max_shift)}")
+    said += [*own_words[1:], other_damping]
     failed = failed or bool(survival.contradiction)
     state = State.FAILED if failed else State.WARNED if warned else State.PASSED
     if own is OwnSet.SEARCHED and state is State.PASSED:
         state = State.UNKNOWN
     rest, followed = survival.statics, SurvivalOptions()
     if rest.differentiates:
-        said.append(
-            f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
-            f"bandwidth, {spoken('1 N')} at rest moves the stage "
-            f"{with_unit(rest.compliance, spoken('m'), 2)}"
-        )
+        said += [
+            f"almost a differentiator: {spoken('1 N')} at rest moves the stage "
+            f"{with_unit(rest.compliance, spoken('m'), 2)}",
+            f"|K(0)| is {100 * rest.share:.2g} % of |K| at the bandwidth",
+        ]
     figures |= {
         "stable_shift": list(survival.stable_shift),
         "S_max_shift": list(survival.S_max_shift),
@@ -350,7 +393,7 @@ def survives(
         "robust_set": {OwnSet.KEPT: True, OwnSet.BROKEN: False}.get(own) if own else None,
         "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
-    return VerdictLine(state, "; ".join(said), figures)
+    return VerdictLine.of(state, said, figures)
 
 
 def deployable(survival: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
@@ -360,19 +403,20 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
     if sampling is not None and survival is not None and not survival.contradiction:
         words = (
-            f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
-            "and delay exact at the instants; run deploy for the code"
+            f"designed and judged at {sampling.rate_hz:g} Hz with a delay of "
+            f"{sampling.delay_us:g} us, hold and delay exact; run deploy for the code"
         )
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
-        return VerdictLine(State.PASSED, words, figures)
+        return VerdictLine.of(State.PASSED, (words,), figures)
     if survival is None or sampling is not None or not math.isfinite(survival.delay):
-        return VerdictLine(State.UNKNOWN, "run deploy", figures)
+        return VerdictLine.of(State.UNKNOWN, ("not judged yet: run deploy",), figures)
     rate = 1.5 / survival.delay  # one period of delay, and half a period of hold
     words = (
-        f"run deploy; on the model the delay margin is {with_unit(survival.delay, 's')}, and below "
-        f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
+        f"below {float(f'{rate:.3g}'):g} Hz hold and one sample of delay use up the delay margin "
+        f"of {with_unit(survival.delay, 's')}"
     )
-    return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
+    clauses = ("not judged yet: run deploy", words)
+    return VerdictLine.of(State.UNKNOWN, clauses, figures | {"unstable_below_rate_hz": rate})
 
 
 def _range(low: float, high: float) -> str:

@@ -142,8 +142,8 @@ class Verified(ABC):
 
     def searched(
         self, outcome: FormulationResult, look: GlobalCheck | None
-    ) -> tuple[str, Mapping[str, Any]]:
-        """Where something better was looked for and not found, in words and figures."""
+    ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
+        """Where something better was looked for and not found, in clauses and figures."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
         return search_evidence(starts, optima, look, self.bound_words)

@@ -29,7 +29,7 @@ def robust_words(robust: RobustCheck) -> dict[str, Any]:
         `own` and `own_words`.
     """
     own = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
-    return {"own": own, "own_words": robust.words}
+    return {"own": own, "own_words": (robust.words,)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,16 +123,18 @@ class VerifiedDesign(Verified):
         norm, norm_bound = design.certificate.norm, design.certificate.norm_bound
         figures = {"norm": norm, "norm_bound": norm_bound}
         figures["sensitivity_peak"] = design.sensitivity_peak
-        words = f"closed loop stable, norm {norm:.6g} <= {norm_bound:.6g}, constraints met"
+        words = "closed loop stable, every bound and constraint met"
+        compliance = ""
         if "compliance_max" in bounds:
             figures["compliance_max"] = design.compliance
-            words += f" (compliance {1e6 * design.compliance:.4g} um/N at most)"
+            compliance = f"compliance at most {1e6 * design.compliance:.4g} um/N"
         if not design.certified:
             words = "the closed loop is not certified"
         elif not self.feasible:
             words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
         good = design.certified and self.feasible
-        return VerdictLine(State.PASSED if good else State.FAILED, words, figures)
+        clauses = (words, compliance, f"norm {norm:.6g} <= {norm_bound:.6g}")
+        return VerdictLine.of(State.PASSED if good else State.FAILED, clauses, figures)
 
     def own_set(self) -> dict[str, Any]:
         found = [

@@ -224,10 +224,10 @@ class VerifiedStructured(Verified):
         judged = self.design.certificate
         figures = {} if judged is None else {"figures_over_bounds": judged.worst}
         if not self.certified:
-            return VerdictLine(State.FAILED, self.design.words, figures)
+            return VerdictLine.of(State.FAILED, self.design.words.split("; "), figures)
         if not self.feasible:
             words = "certified, but a constraint on theta is not met"
-            return VerdictLine(State.FAILED, words, figures)
+            return VerdictLine.of(State.FAILED, (words,), figures)
         count = 0 if judged is None else len(judged.plants)
         untested = () if judged is None else judged.grid_only
         most, levels = 1.0 + self.proof.slack, self.proof.levels
@@ -235,9 +235,9 @@ class VerifiedStructured(Verified):
         where = "the model" if count == 1 else f"the {count} plants"
         words = f"stable and within every bound on {where} that it was designed on"
         if on_grid:  # a check that does not exist for a sampled loop is not passed
-            words += f"; {', '.join(on_grid)} on a grid of frequencies alone"
-            return VerdictLine(State.WARNED, words, {**figures, "on_grid_alone": on_grid})
-        return VerdictLine(State.PASSED, words, figures)
+            clauses = (words, f"{', '.join(on_grid)} on a grid of frequencies alone")
+            return VerdictLine.of(State.WARNED, clauses, {**figures, "on_grid_alone": on_grid})
+        return VerdictLine.of(State.PASSED, (words,), figures)
 
     def own_set(self) -> dict[str, Any]:
         return box_words(self.wide, self.checked, self.proof, self.worst, self.drawn,
@@ -268,7 +268,7 @@ class VerifiedStructured(Verified):
 
     def searched(
         self, outcome: FormulationResult, look: GlobalCheck | None
-    ) -> tuple[str, Mapping[str, Any]]:
+    ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
         known, figures = super().searched(outcome, look)
         if self.multistart is None:
             return known, figures
@@ -278,9 +278,10 @@ class VerifiedStructured(Verified):
         words = f"{multistart_words(found)}{of}"
         design = self.multistart.design
         if design.found is not None and design.found < DesignOptions.repeats:
-            words += f", its best not found again from {counted(design.starts, 'start')}"
+            once = f"its best was not found again from {counted(design.starts, 'start')}"
+            known = (*known[:1], once, *known[1:])
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
-        return f"{words}; {known}", figures
+        return (*known, words), figures
 
 
 def multistart_words(ends: Sequence[float]) -> str:

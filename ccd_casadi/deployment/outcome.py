@@ -234,19 +234,20 @@ def deployed_line(
         "move": None if moved is None else moved.limited_entry,
     }
     if found.shortfalls:
-        return VerdictLine(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
-    kept = f"{at}: {_loop_words(K)}"
+        return VerdictLine.of(State.FAILED, (f"{at}: {found.shortfalls[0]}",), figures)
+    kept = [f"{at}: {_loop_words(K)}"]
     if found.members:
-        kept = f"{at}: on the model {_loop_words(K)}"
+        kept = [f"{at}: on the model {_loop_words(K)}"]
         worst = found.worst
         if worst.figures is not K:
-            where = place_words(worst.at)
-            kept += f"; on the plant with the largest peak ({where}) {_loop_words(worst.figures)}"
+            kept.append(
+                f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
+            )
     ends = limit_words(figures["move"] or {})
-    reason = "; ".join(filter(None, (reason_words(run, found), *found.levels, ends)))
-    if reason:
-        return VerdictLine(State.WARNED, f"{kept}; {reason}", figures)
-    return VerdictLine(State.PASSED, kept, figures)
+    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends))]
+    if reasons:
+        return VerdictLine.of(State.WARNED, (*reasons, *kept), figures)
+    return VerdictLine.of(State.PASSED, kept, figures)
 
 
 def limit_words(move: Mapping[str, Any]) -> str:
@@ -275,7 +276,7 @@ def _loop_words(found: SampledFigures) -> str:
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:
-    """The order, as in `4 of 6 states (7 synthesised), and 1 of the lead filter`.
+    """The order, as in `5 states: 4 after reduction (of 6; 7 synthesised), 1 of the lead filter`.
 
     Parameters
     ----------
@@ -290,12 +291,15 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
     orders = [item.chosen.order for item in found.orders]
     if kind_of(run.problem).as_designed:
         return f"{' + '.join(map(str, orders))} states, as designed"
-    words = " + ".join(
-        f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
+    kept, before = (
+        " + ".join(map(str, each))
+        for each in (orders, [item.rows[0].order for item in found.orders])
     )
-    more = len(found.realisation.system.A) - found.order
-    lead = f", and {more} of the lead filter" if found.conversion is Conversion.LEAD else ""
-    return f"{words} states ({len(run.controller.A)} synthesised){lead}"
+    states = len(found.realisation.system.A)
+    more = states - found.order
+    lead = f", {more} of the lead filter" if found.conversion is Conversion.LEAD else ""
+    reduced = f"{kept} after reduction (of {before}; {len(run.controller.A)} synthesised)"
+    return f"{states} states: {reduced}{lead}"
 
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
@@ -361,6 +365,6 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
         allowed = 100.0 * found.target.excess
         parts.append(
             f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
-            f"{allowed:.2g} % is allowed for a deployment"
+            f"a deployment may exceed it by {allowed:.2g} %"
         )
     return "; ".join(parts)

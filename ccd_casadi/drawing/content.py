@@ -4,6 +4,7 @@
 HTML and SVG. Names of classes and fields are keys of that file.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -426,11 +427,59 @@ class VerdictRow:
         `passed`, `warned`, `failed` or `unknown`.
     words : str
         The result in a sentence.
+    details : tuple of str
+        What else is known, folded on a page.
     """
 
     name: str
     state: str
     words: str
+    details: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Bars:
+    """A table whose rows end in a bar, the longest first.
+
+    Attributes
+    ----------
+    head : tuple of str
+        Names of the columns; the bar's is the last.
+    rows : tuple of tuple
+        Values, without the bar.
+    lengths : tuple of float
+        Of the bars; negative ones have another colour.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    lengths: tuple[float, ...]
+
+    @property
+    def table(self) -> Table:
+        """Without the bars."""
+        return Table(self.head[:-1], self.rows)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Of the longest bar, in percent."""
+        most = max(map(abs, self.lengths), default=0.0) or 1.0
+        return tuple(100.0 * length / most for length in self.lengths)
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Blocks behind a line that opens them; printed pages show them.
+
+    Attributes
+    ----------
+    summary : str
+    body : tuple
+        Of facts, tables and words.
+    """
+
+    summary: str
+    body: tuple[Words | Bullets | Facts | Table | Source, ...]
 
 
 @dataclass(frozen=True)
@@ -460,6 +509,8 @@ class Head:
         What to do next, in a sentence or two.
     own_decision : bool
         Whether it answers another question than whether to build the run's design.
+    folded : bool
+        The page is about something else than the verdict: a count of its lines opens them.
     """
 
     title: str
@@ -471,10 +522,17 @@ class Head:
     verdict: tuple[VerdictRow, ...] = ()
     decision: str = ""
     own_decision: bool = False
+    folded: bool = False
+
+    @property
+    def counted(self) -> str:
+        """The lines of the verdict by their states."""
+        states = Counter(line.state for line in self.verdict)
+        return ", ".join(f"{count} {state}" for state, count in states.items())
 
 
 Text = Words | Heading | Bullets | Links | Source | Facts | Verdict
-Block = Text | Table | Figure | Picture | Steps
+Block = Text | Table | Bars | Figure | Picture | Steps | Fold
 
 
 @dataclass(frozen=True)
@@ -487,11 +545,14 @@ class Chapter:
     body : tuple of Block
     own_page : bool
         It starts a page in print.
+    folded : bool
+        Its heading opens it; printed pages show it.
     """
 
     heading: str
     body: tuple[Block, ...]
     own_page: bool = False
+    folded: bool = False
 
 
 @dataclass(frozen=True)

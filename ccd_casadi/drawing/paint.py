@@ -117,7 +117,7 @@ def _of_landscape(land: Landscape) -> tuple[Table, ...]:
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
 # Our scripts, in assets/, and what in a body needs them; some bring their style.
 SCRIPTS = {"cursor": " data-axes=", "zoom": " data-axes=", "steps": '<div class="steps">',
-           "turntable": 'class="turntable"'}  # fmt: skip
+           "save": '<div class="save">', "turntable": 'class="turntable"'}  # fmt: skip
 STYLED = ("steps", "turntable")
 
 

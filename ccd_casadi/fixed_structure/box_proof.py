@@ -249,15 +249,20 @@ class Proof:
     @property
     def words(self) -> str:
         """The outcome in one line, with its levels."""
+        return "; ".join(self.clauses)
+
+    @property
+    def clauses(self) -> tuple[str, ...]:
+        """The outcome, its levels, and what the proof is not of."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
             name, factor = key_words(self.passed[0]), self.passed[1]
-            return f"{name} is exceeded by a factor of {factor:.4g} at {at}"
+            return f"a plant of the set exceeds {name} by a factor of {factor:.4g}", f"at {at}"
         if self.outcome is ProofOutcome.UNSTABLE:
-            return f"the proof denies it: {self.outcome.value}"
+            return (f"the proof denies it: {self.outcome.value}",)
         if not self.stable:
-            return f"searched, not proven: {self.outcome.value}"
-        left = f"; {self.unasked}" if self.channels else ""
+            return (f"searched, not proven: {self.outcome.value}",)
+        left = (self.unasked,) if self.channels else ()
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
             over = [
@@ -267,14 +272,16 @@ class Proof:
             ]
             whose = "its bound" if len(over) == 1 else "their bounds"
             return (
-                f"not every bound is proven: the whole box is stable by {self.boxes} enclosures, "
-                f"but {', '.join(over)} only below {worst:.5g} of {whose}{left}"
+                f"not every bound is proven: {', '.join(over)} only below {worst:.5g} of {whose}",
+                f"stable on the whole box by {self.boxes} enclosures",
+                *left,
             )
         of_S = max((v for k, v in self.levels.items() if k not in ("KS", "T", "GS")), default=0.0)
         own = f"|S| at most {of_S:.5g} and " if of_S < worst else ""
         return (
             f"proven for the whole box by {self.boxes} enclosures: stable, {own}every figure at "
-            f"most {worst:.5g} of its bound{left}"
+            f"most {worst:.5g} of its bound",
+            *left,
         )
 
 

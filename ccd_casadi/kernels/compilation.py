@@ -1,13 +1,14 @@
-"""Compiling every kernel once, on two processes, with words; and doing so when a user comes first.
+"""Compiling kernels once, on two processes, with words; and doing so when a user comes first.
 
 Numba compiles a function when it is first called and keeps it on disk, beside the sources or,
-where these cannot be written, in the user's own cache. One process does the search for γ_opt
-and the rows of structured loops, the other the certificate and their curvature; each loads from
-disk what the other has already left there.
+where these cannot be written, in the user's own cache. There are two groups, of which most jobs
+need one: the synthesis (search for γ_opt, certificate) and structured loops (rows, curvature). A
+group is compiled when its first kernel is called, on two processes; each loads from disk what the
+other has already left there.
 
-A stamp beside the compiled kernels names the sources, Numba and the processor that they are
-for. The first compilation that finds no such stamp starts the two processes, says so on stderr,
-and waits: so does a program that imports this package as a library. A lock lets one process
+A stamp for each group beside the compiled kernels names the sources, Numba and the processor that
+they are for. The first compilation that finds no such stamp starts the two processes, says so on
+stderr, and waits: so does a program that imports this package as a library. A lock lets one process
 compile; others wait for it. Ctrl-C leaves whole files only, and the next one goes on from these.
 """
 
@@ -33,7 +34,12 @@ from ccd_casadi.support.terminal import Progress, say
 from surrogates.files import write_whole
 
 PACKAGE = __name__.rpartition(".")[0]
-PARTS = ("search", "certificate", "rows", "curvature")
+GROUPS = {"synthesis": ("search", "certificate"), "loops": ("rows", "curvature")}
+PARTS = tuple(part for parts in GROUPS.values() for part in parts)
+SECONDS = {"synthesis": 37.0, "loops": 23.0}  # of one core, as measured
+LOOPS = ("loop_grid", "loop_point", "modes", "sections")  # modules of that group
+# Of both groups, and all that `check` needs: a few seconds, compiled where they are called.
+SHARED = ("frequency", "linear_algebra")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
 
 
@@ -62,11 +68,13 @@ def compile_part(part: str) -> None:
         lyapunov_triangular(-np.eye(2), np.eye(2), False)
         gamma.optimal_gamma(H0, gp.B1, gp.C1, gp.d1, 0.6, 0.0, 1e-11, 1e-7)
         synthesis.central_controller(gp, H0, 10.0)
+        gamma.plant_gain(A, B, C, grid)
+        gamma.gamma_lower_bound(frequency.prepare(A, B, C), w, grid, np.ones(41))
+        squared_weights(w, grid)
         row = synthesis.synthesise(A, B, C, w, grid, np.ones(41), 1.02, 0.0, False)[0]
         if row[0] != 0.0:
             raise SystemExit("the compiled kernels find no controller where there is one")
     else:
-        gamma.plant_gain(A, B, C, grid)
         row = np.empty(int(design.Column.COUNT))
         judged = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
         for delta in (0.0, 1.0):
@@ -76,8 +84,6 @@ def compile_part(part: str) -> None:
         G = frequency.prepare(A, B, C)
         sensitivity.sensitivity_gain(G, G, none, 1.0)
         frequency.response(G, 1.0)
-        gamma.gamma_lower_bound(G, w, grid, np.ones(41))
-        squared_weights(w, grid)
         sensitivity.axis_frequencies(A, B, C, none, 1.0)
 
 
@@ -107,52 +113,67 @@ def _compile_rows(curvature: bool) -> None:
         loop_point.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
 
-def is_compiled() -> bool:
-    """Whether the stamp says so."""
-    return _read(_folder(_kernels()) / "compiled.stamp") == _state()
+def group_of(module: str) -> str:
+    """The group of a kernel, by the name of its module; empty of a shared one."""
+    name = module.rpartition(".")[2]
+    return "" if name in SHARED else "loops" if name in LOOPS else "synthesis"
 
 
-def ensure_compiled(*, seconds: float = 60.0) -> None:
-    """Compile all kernels on two processes unless the stamp says that they are; words on stderr.
+def is_compiled(group: str) -> bool:
+    """Whether the group's stamp says so."""
+    return _read(_stamp(_folder(_kernels()), group)) == _state()
 
-    `seconds` of one core, as measured, are announced. What a process leaves undone is compiled
-    where it is needed, in silence.
+
+def ensure_compiled(*groups: str) -> None:
+    """Compile groups of kernels, all if none is named, on two processes unless their stamps say
+    that they are; words on stderr.
+
+    What a process leaves undone is compiled where it is needed, in silence.
     """
-    if is_compiled():
+    groups = groups or tuple(GROUPS)
+    if all(map(is_compiled, groups)):
         return
     kernels = _kernels()
     folder = _folder(kernels)
-    stamp, state = folder / "compiled.stamp", _state()  # before: sources may change meanwhile
+    state = _state()  # before: sources may change meanwhile
     with _alone(folder / "compiled.lock"):
-        if _read(stamp) == state:  # another process has done it
+        missing = [group for group in groups if _read(_stamp(folder, group)) != state]
+        if not missing:  # another process has done it
             return
-        count = min(len(PARTS), usable_cores())
+        parts = tuple(part for group in missing for part in GROUPS[group])
+        count, seconds = min(len(parts), usable_cores()), sum(SECONDS[group] for group in missing)
+        kernels = {name: kernel for name, kernel in kernels.items()
+                   if group_of(name.rpartition(".")[0]) in ("", *missing)}  # fmt: skip
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
             f" about {seconds / count:.0f} s on {count} core{'s' if count > 1 else ''}"
         )
         try:
-            done = _compile(kernels, count)
+            done = _compile(kernels, folder, parts, count)
         except OSError as error:  # no process to be had: the kernels compile as they are called
             _say(f"ccd_casadi: not done beforehand ({error})")
             return
-        if done:
+        for group in missing if done else ():
             with contextlib.suppress(OSError):
-                write_whole(stamp, state)
+                write_whole(_stamp(folder, group), state)
 
 
-def _compile(kernels: dict[str, Any], count: int) -> bool:
+def _stamp(folder: Path, group: str) -> Path:
+    return folder / f"compiled_{group}.stamp"
+
+
+def _compile(kernels: dict[str, Any], folder: Path, parts: tuple[str, ...], count: int) -> bool:
     """Run the parts on `count` processes, with a bar of kernels; whether all ended well."""
     root = str(Path(__file__).parents[PACKAGE.count(".") + 1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
     settings = os.environ | {WORKER: "1", "PYTHONPATH": path}
-    folder, began, workers = _folder(kernels), time.time(), []
+    began, workers = time.time(), []
     # not -m, with which the package would import all that its commands need
     start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
     with Progress(len(kernels), "compiling kernels") as bar:
         try:
             for first in range(count):
-                command = [*start, *PARTS[first::count]]
+                command = [*start, *parts[first::count]]
                 workers.append(subprocess.Popen(command, env=settings, stdout=subprocess.DEVNULL))
             while any(worker.poll() is None for worker in workers):
                 time.sleep(0.1)

@@ -17,17 +17,21 @@ PACKAGE = __name__.rpartition(".")[0]
 
 
 class _FirstCompilation(event.Listener):
-    """Where a kernel is not on disk: all of them are compiled at once, with words."""
+    """Where a kernel is not on disk: all of its group are compiled at once, with words."""
 
     def __init__(self) -> None:
-        self.seen = "CCD_CASADI_COMPILES" in os.environ  # by itself, one after the other
+        self.alone = "CCD_CASADI_COMPILES" in os.environ  # by itself, one after the other
+        self.seen: set[str] = set()
 
     def on_start(self, event: Any) -> None:
         module = event.data["dispatcher"].py_func.__module__
-        if not self.seen and module.startswith(PACKAGE + "."):
-            self.seen = True
-            # which itself imports the kernels
-            import_module(f"{PACKAGE}.compilation").ensure_compiled()
+        if self.alone or not module.startswith(PACKAGE + "."):
+            return
+        compilation = import_module(f"{PACKAGE}.compilation")  # which itself imports the kernels
+        group = compilation.group_of(module)
+        if group and group not in self.seen:
+            self.seen.add(group)
+            compilation.ensure_compiled(group)
 
     def on_end(self, event: Any) -> None:
         pass

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions, clauses_of
 from ccd_casadi.drawing.content import VerdictRow
 from ccd_casadi.reporting.concerns import (
     current_concern,
@@ -166,7 +166,8 @@ def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
     for name in LINES:
         line = verdict.get(name)
         if isinstance(line, Mapping) and line.get("state") in set(State):
-            found.append(VerdictRow(name, str(line["state"]), str(line.get("words", ""))))
+            words, *details = clauses_of(line)
+            found.append(VerdictRow(name, str(line["state"]), words, tuple(details)))
     return tuple(found)
 
 

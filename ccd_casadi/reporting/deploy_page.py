@@ -67,14 +67,17 @@ def deploy_page(
         c.Chapter("Figures", _facts(run, found)),
     ]
     if found.sampled.stable:
-        chapters.append(c.Chapter("Step of the reference", (_step(run, found),)))
+        step = (_step(run, found),)
+        chapters.append(c.Chapter("Step of the reference", step, folded=True))
     if moved is not None:
         chapters.append(c.Chapter("A move on the machine", move_blocks(moved)))
     chapters += [
         c.Chapter("Sampling rate", _words("rate", found)),
-        c.Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
+        c.Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run)),
+                  folded=True),
         c.Chapter("As sections",
-                tuple(block for item in found.orders for block in _sections(item, run))),
+                  tuple(block for item in found.orders for block in _sections(item, run)),
+                  folded=True),
     ]  # fmt: skip
     if found.stable:
         chapters.append(c.Chapter("The code", _code(found)))
@@ -85,7 +88,7 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
-    return f"The controller has {order_words(run, found)}.{rest}"
+    return f"The deployed controller has {order_words(run, found)}.{rest}"
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:

@@ -320,35 +320,36 @@ def _sentence(
     falls = multiplier * step  # J does
     in_J = f"J falls by {number(falls, 3)}"
     if held is None or not problem.w2:
-        return f"{words}; {loosened}: {in_J}, to first order."
+        return f"{words}. {loosened}: {in_J}."
     cost = step * held.get(name, 0.0)
     value = (-falls - problem.w1 * cost) / problem.w2
     v, changed = problem.figure, f"f by {number(cost, 3)} {problem.cost_unit}".rstrip()
     moves = f"{v.symbol} changes by {v.shown(value, 3)}, {changed} ({in_J})"
-    return f"{words}; {loosened}: {moves}, to first order."
+    return f"{words}. {loosened}: {moves}."
 
 
 def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
     """What holds the design, a step that loosens it (in the multiplier's unit), that in words."""
     inner, (variable, _, end) = problem.inner, name.rpartition(" ")
     if name == "S_max":
-        return f"The peak of S is at S_max = {inner.S_max:g}", 0.01, "raising S_max by 1 %"
+        return f"The peak of S is at S_max = {inner.S_max:g}", 0.01, "Raising S_max by 1 %"
     if name == "S_low":
-        return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "raising S_low by 1 %"
+        return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "Raising S_low by 1 %"
     if name == "compliance_max" and inner.compliance_max is not None:
         most = with_unit(inner.compliance_max, spoken("m")) + spoken("/N")
         words = f"‖GS‖∞ is at compliance_max = {most}"
-        return words, 0.01, "raising it by 1 %"
+        return words, 0.01, "Raising it by 1 %"
     if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
         ends = inner.omega_S if variable == "omega_S" else inner.omega_T
         value, sign = ends[0 if end == "lower" else 1] / HZ, variable.replace("omega", "ω")
         words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
-        return words, 0.01 / float(np.log(ends[1] / ends[0])), "widening the range there by 1 %"
+        return words, 0.01 / float(np.log(ends[1] / ends[0])), "Widening the range there by 1 %"
     if end in ("lower", "upper") and variable in problem.names:
         i = problem.names.index(variable)
         value = (problem.lower if end == "lower" else problem.upper)[i]
         _, unit, factor = theta_axes(problem)[i]
         step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
         words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
-        return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
+        way = "Lowering" if end == "lower" else "Raising"
+        return words, 0.01, f"{way} this bound by {step} {unit}".rstrip()
     return f"The constraint “{name}” binds", 1.0, ""

@@ -27,6 +27,7 @@ from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.support.text import HZ, display_unit, number, spoken
 
+PERCENT = 0.01
 MOST = 12  # designs along the front that are drawn
 
 
@@ -172,36 +173,41 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
 
 def table_responses(
     problem: CoDesignProblem, found: PostOptimal, *, rounding: float = 1e-9
-) -> c.Table:
-    """The parameters that the optimum answers to, per unit, in the units of the case file.
+) -> c.Bars:
+    """What the optimum becomes if a parameter of the case grows by 1 %, the most for J first, in
+    the units of the case file; of a parameter that is 0 per unit.
 
     A doubled parameter that moves θ by less than `rounding` of the box does not move it.
     """
-    rows = []
     swept = any(item.ln_omega for item in found.responses)
     lower, upper = lifted_bounds(problem) if swept else box(problem)
     shown = [factor for *_, factor in theta_axes(problem)]
     labels = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
     labels += ["ln ω_S", "ln ω_T"] if swept else []
     sizes = (upper - lower) * np.array([*shown, 1.0, 1.0] if swept else shown)
+    rows = []
     for item in found.responses:
         name, value, factor, unit = _unit(problem, item.parameter, item.value)
         moved = [abs(item.objective), *np.abs(item.theta), *np.abs(item.ln_omega)]
         if not max((v for v in moved if np.isfinite(v)), default=0.0) > 0.0:
             continue
+        step = PERCENT * abs(item.value) or 1.0 / factor
         moves = (*(f * v for f, v in zip(shown, item.theta, strict=True)), *item.ln_omega)
         theta = ", ".join(
-            f"{label} {number(v / factor, 3)}"
+            f"{label} {number(v * step, 3)}"
             for label, v, size in zip(labels, moves, sizes, strict=True)
             if abs(v) * (abs(item.value) or 1.0) > rounding * size
         )
         still = "does not move" if found.determined or swept else "–"
-        slopes = (item.objective, item.bandwidth / HZ, item.hardware_cost)
-        shown_value = f"{number(value)} {unit}".strip()
-        rows.append((name, shown_value, *(slope / factor for slope in slopes), theta or still))
-    moving = "how θ, ln ω_S and ln ω_T move per unit" if swept else "how θ moves per unit"
-    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
-    return c.Table(head, tuple(rows))
+        slopes = (item.bandwidth / HZ, item.hardware_cost, item.objective)
+        shown_value = f"{number(value)} {unit}".strip() + ("" if item.value else ", per unit")
+        changes = (float(f"{slope * step:.3g}") for slope in slopes)
+        rows.append((step * item.objective, (name, shown_value, theta or still, *changes)))
+    rows.sort(key=lambda row: -abs(row[0]))
+    moving = "θ, ln ω_S and ln ω_T move by" if swept else "θ moves by"
+    cost = f"f by ({problem.cost_unit})" if problem.cost_unit else "f by"
+    head = ("1 % more of", "its value", moving, "ω_b by (Hz)", cost, "J by", "change of J")
+    return c.Bars(head, tuple(row for _, row in rows), tuple(length for length, _ in rows))
 
 
 def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float, float, str]:

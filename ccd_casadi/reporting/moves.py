@@ -29,6 +29,7 @@ POINTS = 600
 STEPS = 200  # points of a force step
 DRAWN = 1200  # points of a curve of a move on the machine
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
+MASS_ERRORS = (-0.01, 0.01)  # relative, of what feedforward takes the mass for
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
     "settled after, ms": lambda m: 1e3 * m.settled,
@@ -42,9 +43,11 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
 }
 
 
-def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
+def move_blocks_of(
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView
+) -> tuple[c.Figure, c.Table]:
     """The case's move, or the default one of `robustness`, on all plants of a design, their rigid
-    bodies free: without and with feedforward."""
+    bodies free: without and with feedforward, and a table of plant by feedforward."""
     loops = view.loops
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
@@ -55,7 +58,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        other = " (another: [move] in the case, or the options of robustness)"
+        other = "; set your own under [move]"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
@@ -63,7 +66,33 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     mm = 1e3 * float(profile.at(np.array([end]))[0, 0])
     made = (mm, 1e3 * end, other, loops[0].sampling is not None, len(loops) > 1)
     words = paragraph("report.move", *made)
-    return ways_figure(dict(zip(ways, found, strict=True)), words)
+    rows = []
+    for name, each in zip(ways, found, strict=True):
+        rows.append((name, "the model", each[0]))
+        if len(each) > 1:
+            rows.append((name, "the worst of its set", max(each, key=lambda m: m.peak_error)))
+    if ahead is not None:
+        wrong = [(1.0 + off) * ahead for off in MASS_ERRORS]
+        tried = moves(loops[:1], wrong, profile, axis=0, window=window,
+                      bandwidth_hz=view.bandwidth_hz)  # fmt: skip
+        rows += [
+            (name, f"the model, feedforward {100.0 * off:+g} %", each[0])
+            for off, each in zip(MASS_ERRORS, tried, strict=True)
+        ]
+    made_ways = ways_figure(dict(zip(ways, found, strict=True)), words)
+    return made_ways, _move_table(rows)
+
+
+def _move_table(rows: Sequence[tuple[str, str, Move]]) -> c.Table:
+    """One error of one move for each feedforward and plant."""
+    unit, scale = display_unit(spoken("m"), max(move.peak_error for *_, move in rows))
+    window = with_unit(rows[0][2].window, spoken("m"))
+    head = ("feedforward", "plant", f"peak error ({unit})", f"within ±{window} from (ms)",
+            spoken("peak force (N)"))  # fmt: skip
+    return c.Table(head, tuple(
+        (way, plant, scale * move.peak_error, 1e3 * move.settled, float(move.peak_force.max()))
+        for way, plant, move in rows
+    ))  # fmt: skip
 
 
 def cycle_chapter(
@@ -217,19 +246,24 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     late = [m for m in made if np.isinf(m.settled)]
-    when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"
     if any(not m.finite for m in made):
         return f"{name}: the simulation was lost, so whether it settles is not known"
+    window, most_error = (with_unit(size, spoken("m")) for size in (made[0].window, peak))
+    words = f"{name}: the error is at most {most_error}"
     if late:
-        when = "does not settle" if any(m.rest > m.window for m in late) else (
-            f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"
-        )  # fmt: skip
-        when += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
-    words = f"{name}: {when}, error of at most {with_unit(peak, spoken('m'))}"
+        watched = with_unit(min(float(m.time[-1]) for m in late), "s")
+        stays = any(m.rest > m.window for m in late)
+        words += ", and does not settle" if stays else f", and has not settled within {watched}"
+        words += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
+    elif settled:
+        words += f", and within +-{window} from {with_unit(settled, 's')} on"
+    else:
+        words += f", always within +-{window}"
     held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
     if held > 0.5 * most:  # at the end of a move, as of a stage on springs
         words += f"; {with_unit(held, spoken('N'))} hold the stage there"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, after the figure's end {with_unit(float(after.max()), spoken('m'))}"
+    left = with_unit(float(after.max()), spoken("m"))
+    return f"{words} ({left} left where the figure ends)"

@@ -149,7 +149,7 @@ def _gains(found: Study) -> Chapter:
     rms = Facts(tuple(facts("noise", found.noise, found.demands)))
     white = (Heading("White noise (one-sided density)"), rms)
     body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
-    return Chapter("Disturbance and noise", body)
+    return Chapter("Disturbance and noise", body, folded=True)
 
 
 def _perturbed(run: FinishedRun, found: Study) -> Chapter:
@@ -252,11 +252,11 @@ def _structured(found: Study) -> list[Chapter]:
     )  # fmt: skip
     lines = Lines(((panel,),), "Structured singular value")
     drawn = Figure(lines, paragraph("robustness.structured", bound))
-    return [Chapter("Structured singular value", (drawn,))]
+    return [Chapter("Structured singular value", (drawn,), folded=True)]
 
 
 def _move(found: Study) -> Chapter:
     ways = {"with mass feedforward" if m.feedforward else "without feedforward": [m]
             for m in found.moves}  # fmt: skip
     drawn = ways_figure(ways, "The loop is simulated exactly.")
-    return Chapter("A move", (*map(Words, _words("move", found)), drawn))
+    return Chapter("A move", (*map(Words, _words("move", found)), drawn), folded=True)

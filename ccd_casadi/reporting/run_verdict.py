@@ -17,6 +17,7 @@ from ccd_casadi.reporting.decision import advice, lines_of, unproven, worst_stat
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped
+from ccd_casadi.support.text import counted
 from surrogates.files import write_whole
 
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
@@ -38,6 +39,21 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     return [wrapped(line, columns(sys.stdout)) for line in lines]
 
 
+def detail_lines(result: Mapping[str, Any]) -> list[str]:
+    """Write what the lines of the verdict rest on for the terminal, a row each.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    list of str
+    """
+    return [f"{line.name}: {words}" for line in lines_of(result) for words in line.details]
+
+
 def head_of(
     title: str, good: bool, status: str, reason: str, meta: str, lead: str,
     result: Mapping[str, Any], decision: str = "",
@@ -51,7 +67,8 @@ def head_of(
     badge = "bad" if not good else "good" if clean else "warn"
     own = bool(decision)
     decision = decision or advice(result)
-    return Head(title, badge, status, reason, meta, lead, lines_of(result), decision, own)
+    lines = lines_of(result)
+    return Head(title, badge, status, reason, meta, lead, lines, decision, own, folded=True)
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
@@ -63,7 +80,7 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
     reason = head_words(result) if good else why
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
     status = STATUS.get(result["status"], "not verified")
-    return head_of(title, good, status, reason, meta, lead, result)
+    return replace(head_of(title, good, status, reason, meta, lead, result), folded=False)
 
 
 def head_words(result: Mapping[str, Any]) -> str:
@@ -87,7 +104,8 @@ def head_words(result: Mapping[str, Any]) -> str:
     if not warned and unproven(result) is not None:
         return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
-        return "all checks passed" + ("; the loop needs a look" if loop_concerns(result) else "")
+        count = len(loop_concerns(result))
+        return "all checks passed" + (f", with {counted(count, 'reservation')}" if count else "")
     return f"with warnings: {', '.join(warned)}"
 
 

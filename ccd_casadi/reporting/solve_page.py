@@ -43,7 +43,7 @@ from ccd_casadi.reporting.landscape import (
 )
 from ccd_casadi.reporting.limit_figures import budget_chapter, limit_blocks, start_chapter
 from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
-from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
+from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_blocks_of
 from ccd_casadi.reporting.nyquist import bode
 from ccd_casadi.reporting.run_verdict import publish, run_head
 from ccd_casadi.reporting.structured_page import (
@@ -160,13 +160,15 @@ def design_parts(
     result: Mapping[str, Any],
 ) -> dict[str, Part]:  # fmt: skip
     """The chapters about a design by itself; `own`: the problem with its design plant chosen."""
-    move = cache(lambda: move_figure(own, theta, view))
+    move = cache(lambda: move_blocks_of(own, theta, view))
     parts: dict[str, Part] = {
-        "glance": lambda: [_required_first(result, glance(own, theta, view, move()))],
+        "glance": lambda: [_required_first(result, glance(own, theta, view, move()[0]))],
         "design": lambda: [design_chapter(problem, result)],
-        "move": lambda: [c.Chapter("A move", (move(),))],
+        "move": lambda: [c.Chapter("A move", move(), folded=True)],
         "motor": lambda: cycle_chapter(own, theta, result),
-        "force": lambda: [c.Chapter("A step of force", (force_step(own, theta, view),))],
+        "force": lambda: [
+            c.Chapter("A step of force", (force_step(own, theta, view),), folded=True)
+        ],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_chapter(own, theta, view.loop.controller),
         "loop": lambda: _loop(own, theta, view),
@@ -188,13 +190,14 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     structured = "proof" in result
+    kind = "structured" if structured else "design"
     binds = (binding_words if structured else binding)(problem, result)
     body = (
         theta_table(problem, result),
-        c.Facts(tuple(facts("structured" if structured else "design", problem, result))),
         c.Heading("What binds"),
         c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
         *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
+        c.Fold("All figures of the design", (c.Facts(tuple(facts(kind, problem, result))),)),
     )
     return c.Chapter("The design", body)
 
@@ -213,10 +216,10 @@ def _theta(
         paths = (c.ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
         figure = c.Figure(land, caption_landscape(land, best) + extra)
-        return c.Chapter("Bandwidth over the hardware", (figure,))
+        return c.Chapter("Bandwidth over the hardware", (figure,), folded=True)
     slices = slices_figure(problem, process, truths, verified.theta, best, extra)
     words = "There is no surrogate, and no design near the optimum to show in its place."
-    return c.Chapter("Bandwidth over the hardware", (slices or c.Words(words),))
+    return c.Chapter("Bandwidth over the hardware", (slices or c.Words(words),), folded=True)
 
 
 def stage_chapters(
@@ -241,7 +244,7 @@ def stage_chapters(
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))
-        found.append(c.Chapter(f"Mode shapes: {name}", (figure,)))
+        found.append(c.Chapter(f"Mode shapes: {name}", (figure,), folded=True))
     return found
 
 
@@ -249,7 +252,7 @@ def _loop(
     problem: CoDesignProblem, theta: Sequence[float], loop: LoopView, *more: c.Table
 ) -> list[c.Chapter]:
     channels = scalar_channels(scaled_plant(problem, theta), loop.loop.controller)
-    plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
+    plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),), folded=True)
     if loop.bounded.asked:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
@@ -267,12 +270,12 @@ def _history(
     if not outcome.iterates:
         direct = result["formulation"] == "direct"
         why = "every step used true values" if direct else result["reason"] or "none was run"
-        return c.Chapter(heading, (c.Words(f"There are no rounds to show: {why}."),))
+        return c.Chapter(heading, (c.Words(f"There are no rounds to show: {why}."),), folded=True)
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return c.Chapter(heading, blocks)
+    return c.Chapter(heading, blocks, folded=True)
 
 
 def _trust(solution: "Solution") -> list[c.Chapter]:
@@ -281,7 +284,7 @@ def _trust(solution: "Solution") -> list[c.Chapter]:
     if not qualities:
         return []
     body = (c.Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
-    return [c.Chapter("Can the surrogate be trusted?", body)]
+    return [c.Chapter("Can the surrogate be trusted?", body, folded=True)]
 
 
 def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
@@ -293,4 +296,4 @@ def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
         c.Heading("The case with its defaults"),
         c.Source(case_to_toml(case).replace(f"{case.path.resolve().parent}/", "")),
     )
-    return c.Chapter("Provenance", body, own_page=True)
+    return c.Chapter("Provenance", body, own_page=True, folded=True)

@@ -10,7 +10,7 @@ from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import at_solve
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.verdict import State, VerdictLine, clauses_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import sigma_max
@@ -268,20 +268,22 @@ def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
         said.append(f"unstable for resonance shifts {' and '.join(ends)}")
     if lost or not hard.worst.stable:
         of = f"{lost} of {len(hard.judged)} plants with hardware within +-{100 * d.tolerance:g} %"
-        said.append(f"{of} unstable{'' if lost else ', the worst that was searched is'}")
+        said.insert(0, f"{of} unstable{'' if lost else ', the worst that was searched is'}")
     tried = (
-        f"shifts of +-{100 * d.shift:g} %, damping times {d.damping[0]:g} to {d.damping[1]:g}, "
-        f"hardware within +-{100 * d.tolerance:g} %"
+        f"robustness tried shifts of +-{100 * d.shift:g} %, damping times {d.damping[0]:g} to "
+        f"{d.damping[1]:g}, hardware within +-{100 * d.tolerance:g} %"
     )
-    words = f"robustness: stable on all plants tried ({tried})"
     if not study.survives:
-        words = f"robustness: {'; '.join(said) or f'not stable on all plants tried ({tried})'}"
+        said = said or ["not stable on all plants that robustness tried"]
+    else:
+        said = ["stable on all plants that robustness tried"]
     state = State(before.get("state", State.UNKNOWN))
     if not study.survives and state is not State.FAILED:
         state = State.WARNED
     elif state is State.UNKNOWN:
         state = State.PASSED
-    figures = {key: value for key, value in before.items() if key not in ("state", "words")}
+    line = ("state", "words", "details")
+    figures = {key: value for key, value in before.items() if key not in line}
     figures["robustness"] = {
         "stable_on_all": study.survives,
         "stable_between": list(study.shift.stable),
@@ -290,7 +292,7 @@ def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
             "worst_stable": hard.worst.stable,
         },
     }  # fmt: skip
-    return VerdictLine(state, "; ".join(filter(None, (words, before.get("words")))), figures)
+    return VerdictLine.of(state, (*said, *clauses_of(before), tried), figures)
 
 
 def _disk(margin: DiskMargin) -> dict[str, float]:

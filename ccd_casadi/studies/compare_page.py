@@ -100,9 +100,8 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table,
             rows.append((label, *_row(answer["published"][name], factors), *["–"] * 6))
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
-        "Syntheses are those to the optimum; what the global check over the box adds to them "
-        "stands beside them. A descent's are those of its best run; all runs are "
-        "in compare.json."
+        "Syntheses count those until the optimum was found; the next column has those of the "
+        "global check over the box. A descent's are those of its best run; compare.json has all."
     )
     if not baseline_of(problem).swept:
         words = (

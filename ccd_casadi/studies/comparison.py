@@ -128,8 +128,8 @@ def _descent(
     ]
     if gap > equal * abs(best["objective"]):
         words.append(
-            f"It stopped: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
-            "from the best one."
+            f"It stopped at {100 * moved:.2g} % of the box from the best design, because "
+            f"{run['stop']}."
         )
     return found, words
 

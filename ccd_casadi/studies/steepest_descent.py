@@ -234,7 +234,7 @@ class Stop(StrEnum):
 
     SMALL_STEP = "no step down to the smallest improves J"
     STATIONARY = "the projected gradient vanishes"
-    ITERATIONS = "the iteration limit"
+    ITERATIONS = "it reached its limit of iterations"
     INFEASIBLE = "no design meets the bounds at the start"
     NO_GRADIENT = "the controller there is not optimal enough to have a gradient"
 

@@ -84,7 +84,7 @@ def test_the_first_to_come_compiles_with_words_and_the_second_does_not(
     empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(compilation, "_compile", lambda kernels, count: asked.append(count) or True)
+    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[-1]) or True)
     compilation.ensure_compiled()
     said = capsys.readouterr().err
     assert "compiling" in said
@@ -98,11 +98,33 @@ def test_the_first_to_come_compiles_with_words_and_the_second_does_not(
     assert len(asked) == 2
 
 
+def test_a_job_compiles_the_group_that_it_needs_and_the_other_when_that_is_needed(
+    empty: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[2]) or True)
+    compilation.ensure_compiled("synthesis")
+    assert compilation.is_compiled("synthesis")
+    assert not compilation.is_compiled("loops")
+    compilation.ensure_compiled()
+    compilation.ensure_compiled("loops")
+    assert asked == [*compilation.GROUPS.values()]
+
+
+def test_the_parts_of_a_group_call_every_kernel_of_its_modules() -> None:
+    """And none of the other group, which would be compiled twice."""
+    groups = {compilation.group_of(name.rpartition(".")[0]) for name in compilation._kernels()}
+    assert groups == {*compilation.GROUPS, ""}
+    assert {f"ccd_casadi.kernels.{name}" for name in compilation.LOOPS} <= {
+        name.rpartition(".")[0] for name in compilation._kernels()
+    }
+
+
 @pytest.mark.parametrize("how", ["ends badly", "interrupted", "no process"])
 def test_what_was_not_finished_is_not_taken_for_finished(
     how: str, empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def ended(kernels: object, count: int) -> bool:
+    def ended(*_: object) -> bool:
         if how == "interrupted":
             raise KeyboardInterrupt
         if how == "no process":
@@ -117,7 +139,7 @@ def test_what_was_not_finished_is_not_taken_for_finished(
         compilation.ensure_compiled()
     assert ("no memory" in capsys.readouterr().err) == (how == "no process")
     asked: list[int] = []
-    monkeypatch.setattr(compilation, "_compile", lambda kernels, count: asked.append(count) or True)
+    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[-1]) or True)
     compilation.ensure_compiled()
     assert len(asked) == 1
 
@@ -127,8 +149,8 @@ def test_two_programs_do_not_compile_the_same(
 ) -> None:
     begun, go, asked = threading.Event(), threading.Event(), []
 
-    def slowly(kernels: object, count: int) -> bool:
-        asked.append(count)
+    def slowly(*told: object) -> bool:
+        asked.append(told[-1])
         begun.set()
         return go.wait(30.0)
 
@@ -152,8 +174,8 @@ def test_a_source_that_changes_meanwhile_is_compiled_again(
     """The stamp named the sources as they were at the end: what was compiled were others."""
     state, asked = ["before"], []
 
-    def edited(kernels: object, count: int) -> bool:
-        asked.append(count)
+    def edited(*told: int) -> bool:
+        asked.append(told[-1])
         state[0] = "after"
         return True
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.codesign.verdict import clauses_of
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import read_pages
 from ccd_casadi.support.json_files import restored
@@ -279,7 +280,7 @@ def _proven(r: Mapping[str, Any], terminal: str, page: c.Page) -> Claims:
     facts = " ".join(" ".join(map(str, row)) for block in _blocks(page, c.Facts)
                      for row in block.rows)  # fmt: skip
     proof, line = r.get("proof"), r["verdict"]["survives"]
-    texts = {"terminal": terminal, "page": plain(facts), "survives": line["words"]}
+    texts = {"terminal": terminal, "page": plain(facts), "survives": "; ".join(clauses_of(line))}
     if proof is None:
         yield from ((" proven for" not in text, f"{where}: proven, no proof")
                     for where, text in texts.items())  # fmt: skip

@@ -3,8 +3,8 @@
     python benchmarks/oracle.py rib_stage_built [FOLDER] [--plants N] [--seed N] [--write]
 
 FOLDER holds controller.json of runs/rib_stage_built.toml (`solve`, or `inner --out`), and
-result.json or inner.json (what `inner` printed) for θ; by default the design of docs/rib_stage.md,
-which lies in benchmarks/rib_stage_design. Each group of 25 plants is one
+result.json or inner.json (what `inner` printed) for θ; by default the design of
+docs/development/rib_stage_study.md, which lies in benchmarks/rib_stage_design. 25 plants are one
 finite-element model: a payload of up to 50 g on one of the centre ribs, up to 30 mm off centre to
 any side, ten or twenty modes, the shipped mesh (every fourth group: no payload, the finer mesh);
 within it every flexible mode is shifted on its own within ±2 % and the damping factor lies between

@@ -1,9 +1,13 @@
 """The pages of a run in a real browser: quiet, readable narrow and dark, whole in print, linked."""
 
+import csv
+import io
 import json
 import re
 import shutil
 from io import BytesIO
+from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from oracles.chromium import chromium
@@ -69,6 +73,37 @@ CONTRAST = r"""() => {
 }"""
 
 
+OPEN = "document.querySelectorAll('.folded').forEach(one => one.open = true)"
+# what is folded and has no height
+HIDDEN = """() => [...document.querySelectorAll(".folded > :not(summary)")]
+  .filter(one => !one.getClientRects().length || !one.getBoundingClientRect().height)
+  .map(one => one.textContent.slice(0, 40))"""
+
+
+# What a reader with a keyboard or a screen reader misses: names, headings, where to scroll.
+ACCESS = r"""() => {
+  const name = one =>
+    one.getAttribute("aria-label") || one.labels?.[0]?.textContent || one.textContent
+  const found = [], all = what => [...document.querySelectorAll(what)]
+  for (const one of all("svg[role=img], button, a, input, summary, nav"))
+    if (!name(one).trim()) found.push(`no name: ${one.outerHTML.slice(0, 60)}`)
+  for (const svg of all("figure svg"))
+    if (svg.getAttribute("role") !== "img" && !svg.closest("svg svg"))
+      found.push("a figure without role")
+  const navs = all("nav").map(name)
+  if (new Set(navs).size < navs.length) found.push("two landmarks of one name")
+  for (const th of all("th")) if (!th.textContent.trim()) found.push("an empty header")
+  for (const one of all("div"))
+    if (one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).overflowX === "auto" &&
+        one.tabIndex < 0 && !one.querySelector("[tabindex='0'], a, button"))
+      found.push(`scrolls without focus: ${one.className}`)
+  const levels = all("h1, h2, h3").map(one => +one.tagName[1])
+  if (levels[0] !== 1 || levels.some((level, i) => i && level > levels[i - 1] + 1))
+    found.push(`headings ${levels}`)
+  return found
+}"""
+
+
 @pytest.fixture(scope="module")
 def one_browser():
     """For all tests here, which need no other event loop: to start one takes a second."""
@@ -100,11 +135,16 @@ def looked_at(browser, pages, schemes=SCHEMES):
         heard = complaints(page)
         for place in pages:
             page.goto(place.as_uri())
+            page.emulate_media(media="print")
+            assert page.evaluate(HIDDEN) == [], place  # printed pages show what is folded
+            page.emulate_media(media="screen")
+            page.evaluate(OPEN)
             for width in WIDTHS:
                 page.set_viewport_size({"width": width, "height": 900})
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, place
                 assert page.evaluate(SPLIT) == [], (place, width)
                 assert page.evaluate(LABELS) == [], (place, width)
+                assert page.evaluate(ACCESS) == [], (place, width)
                 picture(page, f"{name_of(place)}_{width}_{scheme}", whole=True)
             found = page.evaluate(CONTRAST)
             if page.locator("svg text").count():
@@ -119,6 +159,26 @@ def looked_at(browser, pages, schemes=SCHEMES):
             page.emulate_media(media="screen")
         assert not heard
         context.close()
+
+
+def test_a_figure_is_saved_as_a_picture_and_as_numbers(browser, solved):
+    """All points as drawn: |S| of the page is that of result.json at its largest."""
+    folder = solved("lifted")
+    page = browser.new_page()
+    page.goto((folder / "report.html").as_uri())
+    figure = page.locator("figure").first
+    saved = {}
+    for kind in ("SVG", "CSV"):
+        with page.expect_download() as waited:
+            figure.get_by_role("button", name=f"Save this figure as {kind}").click()
+        saved[kind] = Path(waited.value.path()).read_text("utf-8")
+        assert waited.value.suggested_filename == f"at-a-glance-1.{kind.lower()}"
+    assert ElementTree.fromstring(saved["SVG"]).findall(".//{http://www.w3.org/2000/svg}path")
+    head, *rows = csv.reader(io.StringIO(saved["CSV"]))
+    assert head == ["x axis", "y axis", "curve", "x", "y"]
+    peak = max(float(row[4]) for row in rows if row[1].startswith("|S|"))
+    result = json.loads((folder / "result.json").read_text())
+    assert peak == pytest.approx(result["sensitivity_peak"], rel=0.01)  # as far as it is drawn
 
 
 def name_of(place):
@@ -142,6 +202,7 @@ def test_the_pages_of_a_run_are_read_on_any_screen_and_on_paper(browser, solved)
 def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     place = page.locator("svg[aria-label='At a glance: |S| (–)']")
     place.scroll_into_view_if_needed()
     place.hover()
@@ -168,6 +229,7 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
 def test_the_cursor_of_a_nyquist_plot_reads_its_frequency(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator("svg[aria-label='At a glance: Im L (–)']")
     plot.scroll_into_view_if_needed()
     d = json.loads(plot.get_attribute("data-axes"))
@@ -192,6 +254,7 @@ def test_a_part_of_a_figure_is_enlarged_and_the_whole_shown_again(browser, solve
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     heard = complaints(page)
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator("svg[aria-label='At a glance: |S| (–)']")
     plot.scroll_into_view_if_needed()
     box, before = plot.bounding_box(), plot.screenshot()
@@ -221,6 +284,7 @@ def test_a_part_of_a_map_is_enlarged(browser, solved):
     page = browser.new_page(viewport={"width": 1300, "height": 900})
     heard = complaints(page)
     page.goto((solved("lifted") / "report.html").as_uri())
+    page.evaluate(OPEN)
     plot = page.locator(".whole svg[aria-label^=Landscape]")
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()
@@ -264,6 +328,17 @@ def test_words_outside_and_on_each_other_are_noticed(browser):
 
 
 @pytest.mark.slow
+def test_what_is_not_accessible_is_noticed(browser):
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.set_content(
+        "<h2>first</h2><nav>a</nav><nav>a</nav><table><tr><th></th></tr></table><button></button>"
+        "<div style='overflow-x: auto; width: 90px'><p style='width: 500px'>wide</p></div>"
+    )
+    found = " ".join(page.evaluate(ACCESS))
+    for words in ("no name", "two landmarks", "empty header", "without focus", "headings 2"):
+        assert words in found
+
+
 def test_every_page_of_a_run(browser, solved, tmp_path):
     folder = shutil.copytree(
         solved("lifted"), tmp_path / "run", ignore=shutil.ignore_patterns("*-shm", "*-wal")

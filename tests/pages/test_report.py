@@ -247,8 +247,8 @@ def test_the_page_says_what_the_result_says(run: Any, name: str) -> None:
 def test_what_binds_is_said_in_words(run: Any) -> None:
     text = run("two_mass")[4].replace("\xa0", " ")
     number_ = r"([-+.\de⁻·−]+)"
-    for words in ("m1 is at its lower bound, 55 kg; moving the bound outwards by 0.15 kg",
-                  r"raising S_max by 1 %"):  # fmt: skip
+    for words in ("m1 is at its lower bound, 55 kg. Lowering this bound by 0.15 kg",
+                  r"Raising S_max by 1 %"):  # fmt: skip
         told = rf"{words}: ω_b changes by {number_} Hz, f by {number_} kg \(J falls by {number_}\)"
         said = re.search(told, text)
         assert said is not None

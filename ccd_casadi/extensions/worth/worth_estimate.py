@@ -327,8 +327,8 @@ def worth_words(result: Mapping[str, Any], *, options: WorthOptions = WorthOptio
             f"hardware cost {result['hardware_cost_percent']:+z.1f} %, "
             f"bandwidth {result['bandwidth_percent']:+z.1f} % "
             "against the sequential design. Both designs are certified.",
-            f"full solve    hardware cost {cost} %, bandwidth {bandwidth} % expected: an estimate, "
-            f"no bound{unsettled}",
+            f"full solve    will probably end at hardware cost {cost} %, bandwidth {bandwidth} % "
+            f"(an estimate){unsettled}",
         ]
     for label, each in (("sequential", result["sequential"]), ("co-design", result["co_design"])):
         hz = f"{number(each['bandwidth_hz'])} Hz"
