@@ -41,6 +41,9 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
            help="deploy a run that is not verified; the result is not verified either"),
     option("--saturation", metavar="NEWTON", type=positive,
            help="limit every u to plus or minus this, with anti-windup (default: off)"),
+    option("--single", action="store_true",
+           help="C code in single precision (float), whose rounded coefficients are judged; no "
+           "structured text"),
     option("--fmu", action="store_true",
            help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
            "names"),
@@ -67,6 +70,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     write_fmu = extensions.function("fmu") if options.fmu else None
     if options.fmu and write_fmu is None:
         raise UserError(extensions.missing("--fmu", "functions", "fmu"))
+    if options.fmu and options.single:
+        raise UserError("--fmu: is of double precision; drop it, or --single")
     finished = read_run(options.run)
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
@@ -93,7 +98,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     moved, steps = None, reduced + 2 + (options.saturation is not None)
     with Progress(steps, "deploying") as bar:
         found = deploy(
-            finished, timing, saturation=options.saturation,
+            finished, timing, saturation=options.saturation, single=options.single,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
         if found.stable:
@@ -113,7 +118,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
                                   "kind": kind.title}  # fmt: skip
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
-        if structured_text is not None:
+        if structured_text is not None and not options.single:
             code = structured_text(K, **naming)
             (folder / source_code.ST_FILE).write_text(code, "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):

@@ -227,6 +227,7 @@ def controller_dict(found: Deployment) -> dict[str, Any]:
         "rate_hz": found.rate_hz,
         "delay": found.delay,
         "saturation": found.realisation.saturation,
+        "precision": "single" if found.realisation.single else "double",
         "back_calculation": None if back is None else back.tolist(),
         "input": "e = r - y",
         "output": "u",

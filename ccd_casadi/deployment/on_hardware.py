@@ -108,7 +108,7 @@ def move(
     sensors on one actuator that of the first place, with references as of `course`. The error is
     that of the `ports`, where they count something else."""
     hardware = hardware or Electronics()
-    K, T = realisation.system, realisation.system.period
+    K, T, number = realisation.system, realisation.system.period, realisation.number
     n, m = len(plant.A), len(K.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
@@ -128,23 +128,25 @@ def move(
     def over(share: float) -> Array:
         return np.asarray(expm(joint * (T * share))[:n])
 
-    x, z, u_now = np.zeros(n), np.zeros(len(K.A)), np.zeros(m)
+    x, z, u_now = np.zeros(n), np.zeros(len(K.A), number), np.zeros(m)
     rows, aim = (output[None] @ plant.C, np.ones(1)) if places else (plant.C, reference)
     if ports is not None:
         rows, aim = ports.counted, ports.wanted[:, 0 if places else axis]
     error, force = np.zeros((count, len(aim))), np.zeros((count, m))
+    A, B, C, D = (M.astype(number) for M in (K.A, K.B, K.C, K.D))
     limit, gain = realisation.saturation, realisation.back_calculation
+    ahead = ahead.astype(number)
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
         r = reference * wanted[0, k]
         error[k] = aim * wanted[0, k] - rows @ x
-        e = r - _stepped(y, hardware.sensor_step)
-        v = K.C @ z + K.D @ e + ahead[k]
+        e = (r - _stepped(y, hardware.sensor_step)).astype(number)
+        v = C @ z + D @ e + ahead[k]
         u = v if limit is None else np.clip(v, -limit, limit)
-        z = K.A @ z + K.B @ e
+        z = A @ z + B @ e
         if gain is not None:
-            z = z + gain @ (u - v)
+            z = z + gain.astype(number) @ (u - v)
         clipped += bool(np.any(u != v))
         force[k] = _stepped(u, hardware.force_step)
         now, end = float(k), k + 1.0

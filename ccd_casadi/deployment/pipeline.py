@@ -22,6 +22,7 @@ from ccd_casadi.deployment.realisation import (
     LoopChannel,
     along_directions,
     assemble,
+    in_single,
     realise,
     scalar_channels,
     whole_loop,
@@ -162,12 +163,22 @@ SHORTEN_IT = "shorten it"
 DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
 
 
+@dataclass(frozen=True)
+class CodeForm:
+    """What is required of the code: its largest force in N, and whether it is of single
+    precision."""
+
+    saturation: float | None = None
+    single: bool = False
+
+
 @one_blas_thread
 def deploy(
     run: FinishedRun,
     timing: Timing,
     *,
     saturation: float | None = None,
+    single: bool = False,
     progress: Callable[[str], None] = lambda words: None,
     options: DeploymentOptions = DeploymentOptions(),
 ) -> Deployment:
@@ -183,8 +194,9 @@ def deploy(
         As `read_run` gives it.
     timing : Timing
         Rate and delay, where they are given.
-    saturation, progress : float, callable
-        Largest force, N; takes a line at each step.
+    saturation, single, progress : float, bool, callable
+        Largest force, N; whether the code computes in single precision, whose rounded coefficients
+        are judged then; takes a line at each step.
     options : DeploymentOptions
         What is kept of the designed loop.
 
@@ -233,11 +245,12 @@ def deploy(
         reduced = assemble(channels, small)
         figures = run.measured(run.plant, reduced)
     way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
+    code = CodeForm(saturation, single)
     if designed is not None:
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
         way |= {"needed_hz": own_hz, "target": target, "designed": designed}
-        found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+        found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, code, way)
         return replace(found, judge=attempted(_judged, run, found))
     loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + options.added_plants):
@@ -245,9 +258,7 @@ def deploy(
             run, timing, loops, target, family, progress, attempt, remedy
         )
         way |= {"needed_hz": needed, "target": target}
-        found = _assessed(
-            run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way
-        )
+        found = _assessed(run, dense, orders, conversion, rate, timing.delay_at(rate), code, way)
         outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
@@ -285,7 +296,8 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     figures = dict(judged.figures)
     if own.weighted_level is not None:
         own = own if own.places else replace(own, channels=())
-        worst = certify(plants, K, own, sampling, integrator=False).worst
+        runs = found.realisation.as_coded if found.realisation.single else K
+        worst = certify(plants, runs, own, sampling, integrator=False).worst
         figures |= {name: worst[name] for name in ("KS", "T")}
     return replace(judged, figures=figures, words=words)
 
@@ -330,7 +342,7 @@ def _orders(
 
 def _assessed(
     run: FinishedRun, members: Sequence[Member], orders: Sequence[ChannelOrders],
-    conversion: Conversion, rate_hz: float, delay: float, saturation: float | None,
+    conversion: Conversion, rate_hz: float, delay: float, code: CodeForm,
     way: Mapping[str, Any],
 ) -> Deployment:  # fmt: skip
     """A controller as it runs, on the nominal plant and on the members of a set.
@@ -342,8 +354,9 @@ def _assessed(
     places = kind_of(run.problem).bounds().places
     parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
     realisation = with_anti_windup(
-        realise([o.channel for o in orders], parts, saturation), bandwidth
+        realise([o.channel for o in orders], parts, code.saturation), bandwidth
     )
+    realisation = in_single(realisation) if code.single else realisation
     K, nominal = realisation.system, Perturbation()
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
     held = {at: sampled(plant, period, delay) for at, plant in plants.items()}

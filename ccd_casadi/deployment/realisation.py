@@ -4,6 +4,7 @@ saturates."""
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
@@ -111,13 +112,20 @@ class Realisation:
     """x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k in SI; A block-diagonal with these `blocks`.
 
     With a `saturation` in N every u is clipped to ± it, and the states are corrected by what was
-    cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`).
+    cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`). `single`: the code
+    computes with numbers of 24 bits, and the coefficients are such (`in_single`).
     """
 
     system: StateSpace
     blocks: tuple[int, ...]
     saturation: float | None = None
     back_calculation: Array | None = None
+    single: bool = False
+
+    @property
+    def number(self) -> type[np.floating[Any]]:
+        """What the code computes with."""
+        return np.float32 if self.single else np.float64
 
     @property
     def block_entries(self) -> Array:
@@ -130,6 +138,33 @@ class Realisation:
         """Of the coefficients that the code has: nothing of A but its blocks."""
         inside = block_diag(*(np.ones((size, size)) for size in self.blocks))
         return replace(self.system, A=self.system.A * (inside if self.blocks else 1.0))
+
+
+def in_single(realisation: Realisation) -> Realisation:
+    """The same in single precision: what is judged from here on has the rounded coefficients.
+
+    Parameters
+    ----------
+    realisation : Realisation
+        In double precision.
+
+    Returns
+    -------
+    Realisation
+        Every coefficient is the number of 24 bits nearest to it, in a double.
+    """
+
+    def rounded(M: Array) -> Array:
+        return np.asarray(M, np.float32).astype(float)
+
+    K, L, limit = realisation.system, realisation.back_calculation, realisation.saturation
+    return replace(
+        realisation,
+        system=replace(K, A=rounded(K.A), B=rounded(K.B), C=rounded(K.C), D=rounded(K.D)),
+        back_calculation=None if L is None else rounded(L),
+        saturation=None if limit is None else float(np.float32(limit)),
+        single=True,
+    )
 
 
 def realise(
@@ -220,14 +255,15 @@ def difference_equation(
     inputs, then the feedforward, without fused operations: the result equals that of the C code
     bit by bit.
     """
-    K = realisation.system
-    A, B, C, D = (part.tolist() for part in (K.A, K.B, K.C, K.D))
-    x = [0.0] * len(A) if start is None else list(start)
+    K, given = realisation.system, realisation.back_calculation
+    A, B, C, D = (numbers(realisation, part) for part in (K.A, K.B, K.C, K.D))
+    (x,) = numbers(realisation, np.array([np.zeros(len(A)) if start is None else start]))
     limit = realisation.saturation
-    L = None if realisation.back_calculation is None else realisation.back_calculation.tolist()
-    ahead = np.zeros((len(errors), len(C))) if forward is None else np.asarray(forward, float)
+    L = None if given is None else numbers(realisation, given)
+    ahead = np.zeros((len(errors), len(C))) if forward is None else forward
     answers = []
-    for e, f in zip(np.asarray(errors, float).tolist(), ahead.tolist(), strict=True):
+    every = zip(numbers(realisation, errors), numbers(realisation, ahead), strict=True)
+    for e, f in every:
         u, cut = [], []
         for row_c, row_d, extra in zip(C, D, f, strict=True):
             total = dot(row_d, e, dot(row_c, x)) + extra
@@ -242,6 +278,12 @@ def difference_equation(
         x = following
         answers.append(u)
     return np.array(answers).reshape(len(answers), len(C))
+
+
+def numbers(realisation: Realisation, M: Array) -> list[list[float]]:
+    """The rows of a matrix as scalars of the code's precision, with which sums stay in it."""
+    own = np.asarray(M, realisation.number)
+    return [list(row) for row in own] if realisation.single else own.tolist()
 
 
 def dot(gains: Sequence[float], values: Sequence[float], total: float = 0.0) -> float:

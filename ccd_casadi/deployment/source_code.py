@@ -12,6 +12,7 @@ from ccd_casadi.deployment.realisation import (
     difference_equation,
     dot,
     literals,
+    numbers,
     plain_title,
     takeover,
 )
@@ -51,17 +52,19 @@ def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, 
 
 def c_files(
     realisation: Realisation, *, title: str, delay: float, verified: bool,
-    forward: Array | None = None, kind: str = "Controller", tolerance: float = 1e-12,
+    forward: Array | None = None, kind: str = "Controller", tolerance: float | None = None,
 ) -> Mapping[str, str]:  # fmt: skip
     """The three files' texts by name; delay in s; the header says whether the loop was verified,
     and what `kind` of controller it is.
 
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none. `tolerance`, of
-    the largest force: what the test accepts.
+    the largest force: what the test accepts, by default 1e-12, of single precision 1e-6.
     """
+    tolerance = tolerance or (1e-6 if realisation.single else 1e-12)
     K, limit = realisation.system, realisation.saturation
     errors, forwards, first, forces = vectors(realisation)
     values = values_of(realisation, title, delay, verified, kind) | {
+        "real": "float" if realisation.single else "double",
         "rate": f"{1.0 / K.period:.10g}", "ahead": f"{delay + 0.5 * K.period:.6g}",
         "room": max(len(K.A), 1), "limit": None if limit is None else f"{limit:.17g}",
         "blocks": realisation.blocks or (0,), "A": realisation.block_entries,
@@ -100,5 +103,6 @@ def vectors(
     size = limit if limit is not None else error * float(np.abs(K.D).max() + 1.0)
     forwards = size * rng.standard_normal((samples, len(K.C)))
     first = np.full(len(K.C), 0.5 * size)
-    start = [dot(row, [*errors[0], *first]) for row in takeover(K).tolist()]
+    (before,) = numbers(realisation, np.concatenate([errors[0], first])[None])
+    start = [float(dot(row, before)) for row in numbers(realisation, takeover(K))]
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)

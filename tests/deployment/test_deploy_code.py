@@ -16,6 +16,7 @@ from ccd_casadi.deployment.realisation import (
     LoopChannel,
     Realisation,
     difference_equation,
+    in_single,
     realise,
     with_anti_windup,
 )
@@ -234,3 +235,39 @@ def test_a_textbook_controller_reads_as_it_was_made() -> None:
     assert kinds["second-order roll-off"].pole.hz == pytest.approx(600.0, rel=1e-6)
     assert kinds["integrator with zero"].pole is not None
     assert kinds["integrator with zero"].pole.hz == pytest.approx(0.1, rel=1e-6)
+
+
+@compiled
+@few(max_examples=10)
+@given(seed=st.integers(0, 10**6), limited=st.booleans())
+def test_code_in_single_precision_is_the_difference_equation(
+    seed: int, limited: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Bit by bit, over 400 samples, of coefficients that are numbers of 24 bits."""
+    K = random_controller(seed, 2, 2)
+    realisation = of_one_channel(K, 1e3 if limited else None)
+    assume(not limited or np.isfinite(realisation.system.A).all())
+    found = in_single(with_anti_windup(realisation, 100.0) if limited else realisation)
+    for M in (found.system.A, found.system.B, found.system.C, found.system.D):
+        assert (M == M.astype(np.float32)).all()
+    folder = tmp_path_factory.mktemp("single")
+    texts = write_c(folder, found, title="single", delay=1e-4, verified=True)
+    assert "double" not in texts["controller.c"]
+    subprocess.run(COMPILE.split(), cwd=folder, check=True, capture_output=True)
+    assert subprocess.run(["./controller_test"], cwd=folder, check=False).returncode == 0
+    errors = 1e-6 * np.random.default_rng(seed).standard_normal((400, 1))
+    lines = "\n".join(f"{e:.17g}" for e in errors.ravel())
+    ran = subprocess.run(["./controller_test", "-"], cwd=folder, input=lines, text=True,
+                         capture_output=True, check=True)  # fmt: skip
+    forces = np.array([float(line) for line in ran.stdout.split()])
+    np.testing.assert_array_equal(forces, difference_equation(found, errors).ravel())
+
+
+def test_rounding_to_single_precision_is_judged() -> None:
+    """Of a slow pole its distance from 1 is rounded: what is judged has it, and says how far off."""
+    slow = StateSpace(np.array([[1.0 - 3.3e-7]]), np.array([[1e-3]]), np.array([[1e6]]),
+                      np.array([[1e6]]), period=1e-4)  # fmt: skip
+    rounded = in_single(of_one_channel(slow)).as_coded
+    pole, own = (float(one.A[0, 0]) for one in (rounded, slow))
+    assert abs((1.0 - pole) / (1.0 - own) - 1.0) > 0.01
+    assert abs(pole - own) < 2.0**-24

@@ -2,19 +2,19 @@
 
 /* The sizes of A's diagonal blocks, and the blocks row by row. */
 static const int blocks[] = {{ '{' ~ blocks|join(', ') ~ '}' }};
-static const double A[] = {{ initialiser(A) }};
+static const {{ real }} A[] = {{ initialiser(A) }};
 /* Row by row: states x errors, forces x states, forces x errors. */
-static const double B[] = {{ initialiser(B) }};
-static const double C[] = {{ initialiser(C) }};
-static const double D[] = {{ initialiser(D) }};
+static const {{ real }} B[] = {{ initialiser(B) }};
+static const {{ real }} C[] = {{ initialiser(C) }};
+static const {{ real }} D[] = {{ initialiser(D) }};
 {% if L is not none %}
 /* Back-calculation: states x forces. */
-static const double L[] = {{ initialiser(L) }};
+static const {{ real }} L[] = {{ initialiser(L) }};
 {% endif %}
 /* State of a start: states x (errors, then forces). */
-static const double X[] = {{ initialiser(X) }};
+static const {{ real }} X[] = {{ initialiser(X) }};
 /* Feedforward: derivatives x forces x references. */
-static const double F[] = {{ initialiser(F) }};
+static const {{ real }} F[] = {{ initialiser(F) }};
 
 void controller_reset(controller_state *state)
 {
@@ -23,14 +23,14 @@ void controller_reset(controller_state *state)
         state->x[i] = 0.0;
 }
 
-void controller_takeover(controller_state *state, const double e[CONTROLLER_ERRORS],
-                         const double u[CONTROLLER_FORCES])
+void controller_takeover(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                         const {{ real }} u[CONTROLLER_FORCES])
 {
-    const double *x = X;
+    const {{ real }} *x = X;
     int i, j;
 
     for (i = 0; i < CONTROLLER_STATES; i++) {
-        double sum = 0.0;
+        {{ real }} sum = 0.0;
         for (j = 0; j < CONTROLLER_ERRORS; j++)
             sum += *x++ * e[j];
         for (j = 0; j < CONTROLLER_FORCES; j++)
@@ -39,7 +39,7 @@ void controller_takeover(controller_state *state, const double e[CONTROLLER_ERRO
     }
 }
 
-void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES])
+void controller_forward(int axis, const {{ real }} r[5], {{ real }} f[CONTROLLER_FORCES])
 {
     int i, k;
 
@@ -50,26 +50,26 @@ void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES]
     }
 }
 
-void controller_step(controller_state *state, const double e[CONTROLLER_ERRORS],
-                     double u[CONTROLLER_FORCES])
+void controller_step(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                     {{ real }} u[CONTROLLER_FORCES])
 {
-    static const double none[CONTROLLER_FORCES];
+    static const {{ real }} none[CONTROLLER_FORCES];
 
     controller_step_forward(state, e, none, u);
 }
 
-void controller_step_forward(controller_state *state, const double e[CONTROLLER_ERRORS],
-                             const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES])
+void controller_step_forward(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                             const {{ real }} f[CONTROLLER_FORCES], {{ real }} u[CONTROLLER_FORCES])
 {
-    double next[{{ room }}];
+    {{ real }} next[{{ room }}];
 {% if limit is not none %}
-    double cut[CONTROLLER_FORCES];
+    {{ real }} cut[CONTROLLER_FORCES];
 {% endif %}
-    const double *a = A;
+    const {{ real }} *a = A;
     int i, j, block, start = 0;
 
     for (i = 0; i < CONTROLLER_FORCES; i++) {
-        double sum = 0.0;
+        {{ real }} sum = 0.0;
         for (j = 0; j < CONTROLLER_STATES; j++)
             sum += C[i * CONTROLLER_STATES + j] * state->x[j];
         for (j = 0; j < CONTROLLER_ERRORS; j++)
@@ -88,7 +88,7 @@ void controller_step_forward(controller_state *state, const double e[CONTROLLER_
     for (block = 0; start < CONTROLLER_STATES; block++) {
         const int end = start + blocks[block];
         for (i = start; i < end; i++) {
-            double sum = 0.0;
+            {{ real }} sum = 0.0;
             for (j = start; j < end; j++)
                 sum += *a++ * state->x[j];
             for (j = 0; j < CONTROLLER_ERRORS; j++)

@@ -7,6 +7,9 @@
  * {{ delay }} s from reading y to the new u at the actuator, and a zero-order hold.
  *   e: e[i] = r[i] - y[i] in m, i = 0 .. CONTROLLER_ERRORS - 1
  *   u: u[i] in N, i = 0 .. CONTROLLER_FORCES - 1
+{% if real == "float" %}
+ * Its coefficients were judged as they are rounded to float; y - r has to be formed in more digits.
+{% endif %}
  * Compile with -ffp-contract=off where results have to be the same on every machine.
  */
 #ifndef CONTROLLER_H
@@ -18,26 +21,26 @@
 #define CONTROLLER_PERIOD {{ period }}
 
 typedef struct {
-    double x[{{ room }}];
+    {{ real }} x[{{ room }}];
 } controller_state;
 
 /* Put the controller to rest. */
 void controller_reset(controller_state *state);
 
 /* Take over without a jump: the next step with errors e gives the forces u. */
-void controller_takeover(controller_state *state, const double e[CONTROLLER_ERRORS],
-                         const double u[CONTROLLER_FORCES]);
+void controller_takeover(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                         const {{ real }} u[CONTROLLER_FORCES]);
 
 /* One sample: the forces for these errors; the state is advanced. */
-void controller_step(controller_state *state, const double e[CONTROLLER_ERRORS],
-                     double u[CONTROLLER_FORCES]);
+void controller_step(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                     {{ real }} u[CONTROLLER_FORCES]);
 
 /* The same with feedforward f in N added before the limit. */
-void controller_step_forward(controller_state *state, const double e[CONTROLLER_ERRORS],
-                             const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES]);
+void controller_step_forward(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
+                             const {{ real }} f[CONTROLLER_FORCES], {{ real }} u[CONTROLLER_FORCES]);
 
 /* Feedforward of one reference: its position and four derivatives r[0] .. r[4], axis from 0.
  * The forces are those that the plant needs {{ ahead }} s later, when they act. */
-void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES]);
+void controller_forward(int axis, const {{ real }} r[5], {{ real }} f[CONTROLLER_FORCES]);
 
 #endif

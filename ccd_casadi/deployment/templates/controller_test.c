@@ -10,12 +10,12 @@
 
 #define SAMPLES {{ samples }}
 
-static const double errors[] = {{ initialiser(errors) }};
-static const double forwards[] = {{ initialiser(forwards) }};
-static const double first[] = {{ initialiser(first) }}; /* forces that were there before */
-static const double forces[] = {{ initialiser(forces) }};
+static const {{ real }} errors[] = {{ initialiser(errors) }};
+static const {{ real }} forwards[] = {{ initialiser(forwards) }};
+static const {{ real }} first[] = {{ initialiser(first) }}; /* forces that were there before */
+static const {{ real }} forces[] = {{ initialiser(forces) }};
 
-static double size(double value)
+static {{ real }} size({{ real }} value)
 {
     return value < 0.0 ? -value : value;
 }
@@ -23,14 +23,17 @@ static double size(double value)
 static int stream(void)
 {
     controller_state state;
-    double e[CONTROLLER_ERRORS], u[CONTROLLER_FORCES];
+    {{ real }} e[CONTROLLER_ERRORS], u[CONTROLLER_FORCES];
+    double word;
     int i;
 
     controller_reset(&state);
     for (;;) {
-        for (i = 0; i < CONTROLLER_ERRORS; i++)
-            if (scanf("%lf", &e[i]) != 1)
+        for (i = 0; i < CONTROLLER_ERRORS; i++) {
+            if (scanf("%lf", &word) != 1)
                 return 0;
+            e[i] = ({{ real }})word;
+        }
         controller_step(&state, e, u);
         for (i = 0; i < CONTROLLER_FORCES; i++)
             printf("%.17g%c", u[i], i + 1 < CONTROLLER_FORCES ? ' ' : '\n');
@@ -40,7 +43,7 @@ static int stream(void)
 int main(int count, char **words)
 {
     controller_state state;
-    double u[CONTROLLER_FORCES], largest = 0.0, worst = 0.0;
+    {{ real }} u[CONTROLLER_FORCES], largest = 0.0, worst = 0.0;
     int i, k;
 
     if (count > 1 && words[1][0] == '-')
@@ -50,7 +53,7 @@ int main(int count, char **words)
         controller_step_forward(&state, &errors[k * CONTROLLER_ERRORS],
                                 &forwards[k * CONTROLLER_FORCES], u);
         for (i = 0; i < CONTROLLER_FORCES; i++) {
-            const double wanted = forces[k * CONTROLLER_FORCES + i];
+            const {{ real }} wanted = forces[k * CONTROLLER_FORCES + i];
             if (size(wanted) > largest)
                 largest = size(wanted);
             if (!(size(u[i] - wanted) <= worst))
