@@ -249,7 +249,7 @@ def test_code_in_single_precision_is_the_difference_equation(
     assume(not limited or np.isfinite(realisation.system.A).all())
     found = in_single(with_anti_windup(realisation, 100.0) if limited else realisation)
     for M in (found.system.A, found.system.B, found.system.C, found.system.D):
-        assert (M == M.astype(np.float32)).all()
+        assert (M.astype(np.float32) == M).all()
     folder = tmp_path_factory.mktemp("single")
     texts = write_c(folder, found, title="single", delay=1e-4, verified=True)
     assert "double" not in texts["controller.c"]
@@ -264,7 +264,7 @@ def test_code_in_single_precision_is_the_difference_equation(
 
 
 def test_rounding_to_single_precision_is_judged() -> None:
-    """Of a slow pole its distance from 1 is rounded: what is judged has it, and says how far off."""
+    """Of a slow pole its distance from 1 is rounded: what is judged has it so."""
     slow = StateSpace(np.array([[1.0 - 3.3e-7]]), np.array([[1e-3]]), np.array([[1e6]]),
                       np.array([[1e6]]), period=1e-4)  # fmt: skip
     rounded = in_single(of_one_channel(slow)).as_coded
