@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -36,11 +37,18 @@ from surrogates.files import write_whole
 PACKAGE = __name__.rpartition(".")[0]
 GROUPS = {"synthesis": ("search", "certificate"), "loops": ("rows", "curvature")}
 PARTS = tuple(part for parts in GROUPS.values() for part in parts)
-SECONDS = {"synthesis": 37.0, "loops": 23.0}  # of one core, as measured
 LOOPS = ("loop_grid", "loop_point", "modes", "sections")  # modules of that group
 # Of both groups, and all that `check` needs: a few seconds, compiled where they are called.
 SHARED = ("frequency", "linear_algebra")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
+
+
+@dataclass(frozen=True)
+class CompilationOptions:
+    """Seconds of one core, as measured, that each group is announced with."""
+
+    synthesis: float = 37.0
+    loops: float = 23.0
 
 
 def compile_part(part: str) -> None:
@@ -124,7 +132,7 @@ def is_compiled(group: str) -> bool:
     return _read(_stamp(_folder(_kernels()), group)) == _state()
 
 
-def ensure_compiled(*groups: str) -> None:
+def ensure_compiled(*groups: str, options: CompilationOptions = CompilationOptions()) -> None:
     """Compile groups of kernels, all if none is named, on two processes unless their stamps say
     that they are; words on stderr.
 
@@ -141,7 +149,10 @@ def ensure_compiled(*groups: str) -> None:
         if not missing:  # another process has done it
             return
         parts = tuple(part for group in missing for part in GROUPS[group])
-        count, seconds = min(len(parts), usable_cores()), sum(SECONDS[group] for group in missing)
+        count, seconds = (
+            min(len(parts), usable_cores()),
+            sum(getattr(options, group) for group in missing),
+        )
         kernels = {name: kernel for name, kernel in kernels.items()
                    if group_of(name.rpartition(".")[0]) in ("", *missing)}  # fmt: skip
         _say(

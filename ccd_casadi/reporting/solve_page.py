@@ -190,14 +190,14 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     structured = "proof" in result
-    kind = "structured" if structured else "design"
+    rows = facts("structured" if structured else "design", problem, result)
     binds = (binding_words if structured else binding)(problem, result)
     body = (
         theta_table(problem, result),
         c.Heading("What binds"),
         c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
         *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
-        c.Fold("All figures of the design", (c.Facts(tuple(facts(kind, problem, result))),)),
+        c.Fold("All figures of the design", (c.Facts(tuple(rows)),)),
     )
     return c.Chapter("The design", body)
 

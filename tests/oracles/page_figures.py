@@ -164,8 +164,11 @@ def _facts(r: Mapping[str, Any], page: c.Page) -> Claims:
 
 
 def _blocks(page: c.Page, kind: type) -> Iterator[Any]:
+    """Also what is folded."""
     for chapter in page.chapters:
-        yield from (block for block in chapter.body if isinstance(block, kind))
+        for block in chapter.body:
+            inside = block.body if isinstance(block, c.Fold) else (block,)
+            yield from (one for one in inside if isinstance(one, kind))
 
 
 def _panels(page: c.Page, heading: str, label: str) -> Iterator[c.Panel]:
