@@ -27,6 +27,7 @@ from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.kernels.compilation import ensure_compiled
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -133,6 +134,8 @@ def within(minutes: float, sampler: Sampler, formulation: Formulation, seed: int
     Solution
         Its result says whether the budget ended it, and what was not searched.
     """
+    if kernels := sampler.problem.controller.kernels:  # once for an installation: not of a budget
+        ensure_compiled(*kernels)
     with within_budget(minutes) as spent:
         found = co_design(sampler, formulation, seed)
         return of_budget(found, spent, sampler.spent.seconds())

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -76,7 +76,11 @@ class ControllerProblem:
         What J counts of the controller.
     sampling : Sampling or None
     plant_options : tuple of options
+    kernels : tuple of str
+        Groups of compiled kernels that its searches need.
     """
+
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -104,6 +108,8 @@ class ControllerProblem:
 @dataclass(frozen=True)
 class MixedSensitivityProblem(ControllerProblem):
     """An H∞ controller by the weights W_S, W_KS and W_T: the problem states all of it."""
+
+    kernels: ClassVar[tuple[str, ...]] = ("synthesis",)
 
 
 @dataclass(frozen=True)

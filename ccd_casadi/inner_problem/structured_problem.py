@@ -9,7 +9,7 @@ Everything is plain values, as in `problem`: it is hashed, sent to workers and k
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
@@ -119,6 +119,8 @@ class StructuredProblem(ControllerProblem):
     error_warm_starts : tuple of κ in SI
         Of the least RMS error or move time.
     """
+
+    kernels: ClassVar[tuple[str, ...]] = ("loops",)
 
     structure: Structure = field(default_factory=Structure)
     shape: float | None = 1.1
