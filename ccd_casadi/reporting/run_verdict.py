@@ -95,9 +95,9 @@ def head_words(result: Mapping[str, Any]) -> str:
     -------
     str
     """
-    warned, failed = (
+    warned, failed, unknown = (
         [line.name for line in lines_of(result) if line.state == state]
-        for state in (State.WARNED, State.FAILED)
+        for state in (State.WARNED, State.FAILED, State.UNKNOWN)
     )
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
@@ -105,7 +105,8 @@ def head_words(result: Mapping[str, Any]) -> str:
         return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
         count = len(loop_concerns(result))
-        return "all checks passed" + (f", with {counted(count, 'reservation')}" if count else "")
+        words = f"no check failed; unknown: {', '.join(unknown)}" if unknown else "all checks passed"
+        return words + (f", with {counted(count, 'reservation')}" if count else "")
     return f"with warnings: {', '.join(warned)}"
 
 

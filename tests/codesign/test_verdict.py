@@ -407,6 +407,10 @@ def test_every_place_shows_the_same_lines() -> None:
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)
     assert "all checks passed" in shown.head_words(result_of())
+    for name in ("optimal", "predicted", "deployable"):  # what could not run has not passed
+        words = shown.head_words(result_of(**{name: "unknown"}))
+        assert "passed" not in words
+        assert f"unknown: {name}" in words
 
 
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
