@@ -105,7 +105,8 @@ def head_words(result: Mapping[str, Any]) -> str:
         return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
         count = len(loop_concerns(result))
-        words = f"no check failed; unknown: {', '.join(unknown)}" if unknown else "all checks passed"
+        open_ = ", ".join(unknown)
+        words = f"no check failed; unknown: {open_}" if open_ else "all checks passed"
         return words + (f", with {counted(count, 'reservation')}" if count else "")
     return f"with warnings: {', '.join(warned)}"
 
