@@ -468,7 +468,7 @@ class Bars:
 
 
 @dataclass(frozen=True)
-class Fold:
+class FoldedBlocks:
     """Blocks behind a line that opens them; printed pages show them.
 
     Attributes
@@ -532,7 +532,7 @@ class Head:
 
 
 Text = Words | Heading | Bullets | Links | Source | Facts | Verdict
-Block = Text | Table | Bars | Figure | Picture | Steps | Fold
+Block = Text | Table | Bars | Figure | Picture | Steps | FoldedBlocks
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Cha
         c.Heading("What binds"),
         c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
         *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
-        c.Fold("All figures of the design", (c.Facts(tuple(rows)),)),
+        c.FoldedBlocks("All figures of the design", (c.Facts(tuple(rows)),)),
     )
     return c.Chapter("The design", body)
 

@@ -167,7 +167,7 @@ def _blocks(page: c.Page, kind: type) -> Iterator[Any]:
     """Also what is folded."""
     for chapter in page.chapters:
         for block in chapter.body:
-            inside = block.body if isinstance(block, c.Fold) else (block,)
+            inside = block.body if isinstance(block, c.FoldedBlocks) else (block,)
             yield from (one for one in inside if isinstance(one, kind))
 
 
