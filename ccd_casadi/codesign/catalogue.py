@@ -51,6 +51,7 @@ class BranchOptions:
     on_value: float = 1e-6  # of a range: this close to a value of its list an optimum is on it
     no_better: float = 1e-6  # of the terms of J: a bound that is lower by less is cut
     few: int = 4  # combinations up to which all are searched: bounds would save no search
+    foreseen: float = 3600.0  # s: a longer time of searching every combination is not shown
     undecided: int = 12  # lists of which two values are tried where the time is up
 
 
@@ -280,13 +281,15 @@ def _nearest(problem: CoDesignProblem, theta: Mapping[str, float], options: Bran
 
 
 def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: float) -> str:
-    """How far the search is, the bound on what is left, and how long searching it all takes."""
+    """How far the search is, the bound on what is left, and how long searching it all takes, where
+    a person may wait for that."""
     J = min((node.objective for node in nodes if node.whole), default=np.inf)
     best = f"best J {J:.6g}" if np.isfinite(J) else "no combination searched yet"
     rest, bound = sum(part.count for part in left), min((p.bound for p in left), default=np.inf)
     there = f" with J from {bound:.6g}" if np.isfinite(bound) else ""
-    more = duration((perf_counter() - began) / len(nodes) * rest)
-    left_words = f"{rest} of {counted(count, 'combination')} left{there}, {more} at most"
+    seconds = (perf_counter() - began) / len(nodes) * rest
+    more = f", {duration(seconds)} at most" if seconds <= BranchOptions.foreseen else ""
+    left_words = f"{rest} of {counted(count, 'combination')} left{there}{more}"
     return f"lists: {best}, {left_words if rest else 'none left'}"
 
 
