@@ -168,7 +168,7 @@ class MoveTime:
         step = 1j * size
         T, tau = self.hold.period, self.hold.delay
         value, weights, by_duration = self._together(found)
-        K = tustin(self._controller(kappa), T)
+        K = tustin(self.structure.state_space(kappa), T)
         gradient = by_duration * motion.slopes(lambda cycle: cycle.profile.durations.sum())
         signals = [
             forward_force(item.profile, motion.forward + step * slope, self._time, T)
@@ -195,10 +195,6 @@ class MoveTime:
         """In ms."""
         return f"{1e3 * value:.5g} ms of move and settling"
 
-    def _controller(self, kappa: Array) -> StateSpace:
-        """K in the states of `state_spaces`, in which its slopes are taken."""
-        return StateSpace(*(part[0] for part in self.structure.state_spaces(kappa[None])))
-
     @cached_property
     def _sampled(self) -> tuple[StateSpace, ...]:
         hold = self.hold
@@ -218,7 +214,7 @@ class MoveTime:
 
     def _crossings(self, kappa: Array) -> list[_Crossing]:
         T, motion = self.hold.period, self.motion
-        K = tustin(self._controller(kappa), T)
+        K = tustin(self.structure.state_space(kappa), T)
         r, f = self._signals
         window, options = motion.motion.window, self.options
         return [_Crossing(G, K, r, f, window, T, options) for G in self._sampled]

@@ -12,7 +12,7 @@ import scipy
 
 from ccd_casadi.fixed_structure.bounds import BrokenAt, ChannelBounds
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -396,10 +396,10 @@ class ChannelStructure:
         return np.concatenate([one.in_units(part, frequency, gain) for one, part in own])
 
     def state_space(self, kappa: Array) -> StateSpace:
-        """K, outputs of the plant to its inputs, balanced as that of one channel."""
+        """K, outputs of the plant to its inputs."""
         A, B, C, D = (part[0] for part in self.state_spaces(np.asarray(kappa, float)[None]))
         U, V = self.directions
-        return StateSpace(*balanced(A, B @ U.T, V @ C), V @ D @ U.T)
+        return StateSpace(A, B @ U.T, V @ C, V @ D @ U.T)
 
     def state_spaces(self, kappa: Array) -> tuple[Array, Array, Array, Array]:
         """diag(K_1, …, K_c) alone of many parameters κ (N, n), as `Structure` has them."""

@@ -191,7 +191,7 @@ class DesignSearch:
         """κ in SI of one in the problem's units, its controller, and its certificate."""
         structure, P = self.problem.structure, self.problem.plants
         kappa = structure.in_units(inside, P.omega_0, P.force)
-        K = structure.state_space(kappa)
+        K = structure.state_space(kappa).balanced()
         return kappa, K, certify(self.plants, K, self.problem.bounds, self.sampling,
                                  integrator=structure.integrates(self.problem.bounds.error),
                                  workers=self.workers)  # fmt: skip

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from ccd_casadi.kernels.sections import GAIN, INTEGRATOR, PAIR, REAL
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 
@@ -173,13 +173,8 @@ class Structure:
         return np.array(zeros, complex), np.array(poles, complex)
 
     def state_space(self, kappa: Array) -> StateSpace:
-        """K as a real cascade of its sections, e to u.
-
-        Balanced: the gains of leads multiply along a cascade, and states of scales that are far
-        apart (1e17 with three leads) lose every digit of |S| in a closed loop.
-        """
-        A, B, C, D = (part[0] for part in self.state_spaces(np.asarray(kappa, float)[None]))
-        return StateSpace(*balanced(A, B, C), D)
+        """K as a real cascade of its sections, e to u; every section in its own scale."""
+        return StateSpace(*(part[0] for part in self.state_spaces(np.asarray(kappa, float)[None])))
 
     def state_spaces(self, kappa: Array) -> tuple[Array, Array, Array, Array]:
         """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D.

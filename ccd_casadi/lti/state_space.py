@@ -110,6 +110,15 @@ class StateSpace:
         values = eig(system, weight, right=False)
         return np.asarray(values[np.isfinite(values) & (np.abs(values) < infinite)] * unit)
 
+    def balanced(self) -> "StateSpace":
+        """The same in states of even scales (`balanced`).
+
+        The gains of leads multiply along a cascade of sections: its states lie up to 17 decades
+        apart, and nothing is left of the digits of |S| in a closed loop.
+        """
+        A, B, C = balanced(self.A, self.B, self.C)
+        return StateSpace(A, B, C, self.D, period=self.period)
+
     def series(self, then: "StateSpace") -> "StateSpace":
         """`then` behind this system."""
         n, m = len(self.A), len(then.A)

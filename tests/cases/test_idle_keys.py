@@ -13,7 +13,7 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of
 from ccd_casadi.support.text import package_text
 
-TABLES = tomllib.loads(package_text("templates/case.toml"))
+TABLES = tomllib.loads(package_text("templates/case.toml").replace("plant.py", "new_plant.py"))
 PATH = Path(parse_case.__code__.co_filename).parents[1] / "templates" / "case.toml"
 
 

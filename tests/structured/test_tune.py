@@ -104,9 +104,9 @@ def test_a_controller_of_steep_leads_keeps_the_digits_of_S(seed: int) -> None:
     G = StateSpace(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]),
                    np.array([[1.0, 0.0]]), np.zeros((1, 1)))  # fmt: skip
     held = sampled(G, period, 0.0)
-    crossing = held.response(middle) * tustin(structure.state_space(kappa), period).response(middle)
-    kappa[0] -= np.log(np.abs(crossing.item()))
-    K = tustin(structure.state_space(kappa), period)
+    first = tustin(structure.state_space(kappa).balanced(), period)
+    kappa[0] -= np.log(np.abs((held.response(middle) * first.response(middle)).item()))
+    K = tustin(structure.state_space(kappa).balanced(), period)
     by_product = 1.0 / (1.0 + held.response(omega) * K.response(omega))[:, 0, 0]
     by_matrices = closed_loop(held, K).S.response(omega)[:, 0, 0]
     np.testing.assert_allclose(by_matrices, by_product, rtol=1e-7)

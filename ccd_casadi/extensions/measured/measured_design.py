@@ -230,7 +230,7 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
     """The controller at κ with the judge's figures, which may exceed a bound by 1e-5 (rounding)."""
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
-    K = structure.state_space(si)
+    K = structure.state_space(si).balanced()
     figures = judge(problem.responses, K, bounds, period=period, integrator=structure.integrator)
     shares = bounds.shares(figures).items()
     broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
