@@ -95,8 +95,12 @@ $(VENV)/.ready: requirements.lock pyproject.toml
 	wait $$kernels
 	touch $@
 
+# Tests need every kernel: those that are left are compiled while the wheels come.
 $(VENV)/.ready-test: $(VENV)/.ready requirements-test.lock
-	$(PIP) -r requirements-test.lock
+	$(BIN)/python -m ccd_casadi.kernels & \
+	kernels=$$!; \
+	$(PIP) -r requirements-test.lock && \
+	wait $$kernels
 	touch $@
 
 clean:
