@@ -70,20 +70,20 @@ class LoopFigureOptions:
 @dataclass(frozen=True)
 class ForceStep:
     """The largest displacement by a step of 1 N: `size` in m after `seconds`, of output `output` by
-    actuator `actuator` on plant `plant`, all from 0 on; `names` of what moves and by what."""
+    actuator `actuator` on plant `plant`, all from 0 on; `names` of what moves and by what, with
+    their numbers where there are several."""
 
     size: float
     seconds: float
     output: int
     actuator: int
     plant: int
-    names: tuple[str, str] = ("output", "actuator")
+    names: tuple[str, str]
 
     @property
     def pair(self) -> str:
-        """Counted from 1, as a reader does."""
-        moved, by = self.names
-        return f"{moved} {self.output + 1} by {by} {self.actuator + 1}"
+        """What moves by what."""
+        return " by ".join(self.names)
 
     def entry(self, scalar: bool) -> dict[str, Any]:
         """Of result.json; of several channels with the pair in words."""
@@ -203,8 +203,10 @@ def largest_force_step(
         times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
-        names = ("output" if loop.counted is None else "performance",
-                 "actuator" if loop.drive is None else "disturbance")  # fmt: skip
+        moved = f"{'output' if loop.counted is None else 'performance'} {output + 1}"
+        if loop.at and loop.counted is None:
+            moved = f"channel {loop.at[0].name}"  # whose error counts
+        names = moved, f"{'actuator' if loop.drive is None else 'disturbance'} {actuator + 1}"
         found.append(ForceStep(size, float(times[k]), output, actuator, plant, names))
     return max(found, key=lambda step: step.size)
 

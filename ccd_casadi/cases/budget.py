@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from ccd_casadi.budget import (
 )
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import Fail, several, short_repr
-from ccd_casadi.cases.tables import BudgetTable, PlacesTable
+from ccd_casadi.cases.tables import BudgetTable, Parameter, PlacesTable
 from ccd_casadi.plants.places import Places
 
 
@@ -56,6 +56,17 @@ def check_directions(table: PlacesTable, several_plants: bool, fail: Fail) -> No
             words = "gives each plant of robust.plants, and of a parameter that varies, directions "
             words += "of its own, which no controller can follow; drop it, or these plants"
             raise fail(f"places.{name}", words)
+
+
+def check_present(table: PlacesTable, theta: Sequence[Parameter], fail: Fail) -> None:
+    """Raise where an actuator could be there in part, or shares its parameter with another."""
+    for name in table.present:
+        if table.present.count(name) > 1:
+            raise fail("places.present", f"has {name} twice; give each actuator its own")
+        values = next(p.values for p in theta if p.name == name)
+        if not values or not {0.0, 1.0}.issuperset(values):
+            words = "may be other than 0 and 1, and no part of an actuator can be built"
+            raise fail(f"theta.{name}", f"{words}; give values = [0, 1], or fixed")
 
 
 def places_of(table: PlacesTable) -> Places | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases import checks
-from ccd_casadi.cases.budget import check_directions, checked_budget, checked_places
+from ccd_casadi.cases.budget import check_directions, check_present, checked_budget, checked_places
 from ccd_casadi.cases.checks import CaseError, Fail, short_repr
 from ccd_casadi.cases.controller_kinds import check_kind, idle_keys
 from ccd_casadi.cases.controller_tables import ChannelTable, check_filters, check_motion
@@ -182,6 +182,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(f"theta.{parameter.name}.varies", words)
     several = bool(plants) or any(parameter.varies for parameter in fixed)
     check_directions(places, several, fail)
+    check_present(places, (*theta, *fixed), fail)
     check_filters(tables, fail)
     check_motion(tables, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)

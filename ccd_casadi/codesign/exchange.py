@@ -95,7 +95,7 @@ def best_exchange(
                      if tuple(one.values()) not in tried]  # fmt: skip
             fresh.sort(key=lambda one: _away(problem, theta, one))
             for i in range(0, len(fresh), size):
-                if ends_early("exchange of listed values", len(fresh) - i):
+                if ends_early("listed exchange", len(fresh) - i):
                     break
                 some = fresh[i : i + size]
                 tried |= {tuple(one.values()) for one in some}

@@ -212,9 +212,8 @@ class SensorFamily(LoopFamily):
         if self.bounds.weighted_level is not None:
             own = (np.arange(count) == error).astype(float)
             T = numbers.fraction(own, True, ahead=False).enclosed()[:2]
-            found += self._weighted(
-                boxes, self.bounds.weighted_level, _force(numbers, at_actuator), T
-            )
+            KS = _force(numbers, at_actuator, self.outputs)
+            found += self._weighted(boxes, self.bounds.weighted_level, KS, T)
         if self.bounds.compliance_max is not None:
             upper, lower = _compliance(numbers, at_actuator, free, error)
             limit = self.bounds.compliance_max * inside
@@ -261,11 +260,13 @@ class SensorFamily(LoopFamily):
         return np.asarray(found)
 
 
-def _force(numbers: LoopNumbers, whole: Fraction) -> tuple[Array, Array]:
-    """‖KS‖ at most and at least: the root of Σ |K_j S_u|², D times K_j S_u being K̂_j."""
+def _force(numbers: LoopNumbers, whole: Fraction, outputs: Array) -> tuple[Array, Array]:
+    """‖KS‖ at most and at least, by the plant's own outputs: the root of Σ_i |Σ_j U_ij K_j S_u|²,
+    D times K_j S_u being K̂_j. Channels' directions U need not be orthogonal."""
     parts = []
     at_rest = 1.0 if numbers.rigid is None else numbers.most_of_y**2
-    for gain, radius in zip(numbers.gains.T, numbers.of_gains.T, strict=True):
+    gains, of_gains = outputs @ numbers.gains.T, np.abs(outputs) @ numbers.of_gains.T
+    for gain, radius in zip(gains, of_gains, strict=True):
         N = np.abs(gain) * at_rest
         upper, lower, _, good = replace(whole, above=N, of_above=0.0 * whole.of_above).enclosed()
         left = _least_of(whole, good)

@@ -406,7 +406,7 @@ class Loop:
         S = gain(grid)
         at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
         at = at[S[at] > 0.9 * S.max()]  # lower ones are lower between the points, too
-        return float(max(S.max(), *zoomed(gain, grid[at - 1], grid[at + 1])[1]))
+        return float(max((S.max(), *zoomed(gain, grid[at - 1], grid[at + 1])[1])))
 
     @cached_property
     def as_run(self) -> tuple[StateSpace, StateSpace]:

@@ -354,7 +354,7 @@ def _converted(kind: Any, key: str, value: object) -> Any:
 
 
 def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, Any]) -> None:
-    """Raise PlantError unless M, D, K are (n, n), B (n, m) and C (p, n)."""
+    """Raise PlantError unless M, D, K are (n, n), B (n, m), C (p, n), and ports not 0."""
     n = M.shape[0]
     for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
         if matrix.shape != (n, n):
@@ -370,6 +370,14 @@ def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, An
             remedy = "transpose it" if matrix.shape[1 - side] == n else f"make it {n} on that side"
             words = f"{key} is {matrix.shape}; expected {form}, as mass is {M.shape}"
             raise PlantError(f"{words}: {remedy}")
+    for key, matrix in ports.items():
+        entries: list[Any] = ca.SX(matrix).elements()
+        numbers = [one for one in entries if one.is_constant()]
+        if not all(one.is_regular() for one in numbers):
+            raise PlantError(f"{key} is not finite; give numbers, or drop it")
+        if matrix.is_empty() or matrix.is_zero():
+            nothing = "no force acts there" if key == "disturbance" else "it sees nothing"
+            raise PlantError(f"{key} has no entry but 0: {nothing}; give one, or drop it")
 
 
 def mechanics(

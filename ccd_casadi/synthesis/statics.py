@@ -28,11 +28,15 @@ class StaticsOptions:
         hour.
     resting : float
         Of ω_low: where a plant with a pole at 0 is evaluated at rest.
+    apart : float
+        Ratio of two frequencies just above those of integrators, between which K of a channel that
+        integrates falls by as much; by less than its root: not every channel integrates.
     """
 
     differentiator: float = 0.1
     integrator: float = 1e-6
     resting: float = 1e-6
+    apart: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,10 @@ class Statics:
     Attributes
     ----------
     stiffness, compliance : float
-        Least singular value of K(0) in N/m, largest of GS(0) in m/N; of an integrator inf and 0.
+        Least singular value of K(0) in N/m, largest of GS(0) in m/N; where every channel
+        integrates inf and 0.
     share : float
-        |K(0)| over |K(jω_b)|; of an integrator inf.
+        |K(0)| over |K(jω_b)|; inf where any channel integrates.
     low, low_hz : float
         Largest singular value of GS in m/N at this frequency.
     """
@@ -68,7 +73,8 @@ class Statics:
             moved = f"moves it {with_unit(self.compliance, spoken('m'))}, beyond the sensors"
             held = moved if self.compliance else "does not move the stage"
             return f"The controller integrates: a constant force {held}; {low}."
-        found = (
+        found = "" if np.isfinite(self.share) else "Not every channel integrates. "
+        found += (
             f"Static stiffness K(0) = {with_unit(self.stiffness, spoken('N/m'))}: "
             f"a constant force of {spoken('1 N')} moves the stage "
             f"{with_unit(self.compliance, spoken('m'))}, {low}."
@@ -139,6 +145,14 @@ def statics(
     poles, T = controller.poles, controller.period
     rates = np.abs(poles - 1.0) / T if T else np.abs(poles)
     if rates.size and rates.min() <= options.integrator * bandwidth:
+        above = options.apart * options.integrator * bandwidth
+        least, lower = (
+            np.linalg.svd(at(omega), compute_uv=False)[-1]
+            for omega in (above, options.apart * above)
+        )
+        if least < np.sqrt(options.apart) * lower and len(controller.C) > 1 and not places:
+            rest = compliance(0.0 if ports is not None else above, at(above))
+            return Statics(float(least), rest, np.inf, low, omega_low / HZ)
         at_rest = 0.0 if ports is None else compliance(0.0, at(options.resting * omega_low))
         return Statics(np.inf, at_rest, np.inf, low, omega_low / HZ)
     K0 = at(0.0)

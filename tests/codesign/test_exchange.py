@@ -92,4 +92,4 @@ def test_without_time_the_first_combination_is_kept(places: CoDesignProblem) -> 
         found, _ = best_exchange(inner, LISTED, theta, begin)  # type: ignore[arg-type]
     assert found == begin
     assert isinstance(spent, TimeBudget)
-    assert spent.left["exchange of listed values"] > 0
+    assert spent.left["listed exchange"] > 0

@@ -24,6 +24,7 @@ from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardw
 from ccd_casadi.support.errors import PlantError
 
 CASE = Path(__file__).parents[2] / "examples" / "placed_motors" / "case.toml"
+HOLES = CASE.with_name("holes.toml")
 GRID = tuple((x, y) for x in np.linspace(-0.3, 0.3, 5) for y in np.linspace(-0.2, 0.2, 4))
 RIGID = np.array([[1.0, x, y] for x, y in GRID]).T
 KG, INERTIA = 3.0, (0.05, 0.09)
@@ -298,3 +299,28 @@ def test_one_controller_has_no_directions_for_modes_of_several_plants(key: str) 
     varies = {"lower": 0.03, "upper": 0.11, "start": 0.07, "varies": True}
     with pytest.raises(CaseError, match=rf"places\.{key}: .* drop it, or these plants"):
         parse_case(data | {"theta": data["theta"] | {"b": varies}}, CASE)
+
+
+@pytest.mark.parametrize(
+    ("entry", "refused"),
+    [
+        ({"values": [0, 1]}, False),
+        ({"fixed": 1.0}, False),
+        ({"lower": 0, "upper": 1, "integer": True}, False),
+        ({"lower": 0.0, "upper": 1.0}, True),
+        ({"values": [0, 0.5, 1]}, True),
+        ({"fixed": 0.4}, True),
+    ],
+)
+def test_an_actuator_is_there_or_not(entry: dict[str, Any], refused: bool) -> None:
+    """A share of one would make a verified design that nobody can build."""
+    data = tomllib.loads(HOLES.read_text())
+    data["theta"]["p5"] = entry
+    if refused:
+        with pytest.raises(CaseError, match=r"theta\.p5: may be other than 0 and 1"):
+            parse_case(data, HOLES)
+    else:
+        parse_case(data, HOLES)
+    data["places"]["present"][4] = "p4"
+    with pytest.raises(CaseError, match=r"places\.present: has p4 twice"):
+        parse_case(data, HOLES)

@@ -9,6 +9,7 @@ from oracles.helpers import responses
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller
+from ccd_casadi.lti.loop import tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -95,6 +96,28 @@ def test_the_loop_at_rest_is_the_limit_of_low_frequencies(two_mass_run: Path) ->
     assert found.compliance == pytest.approx(abs((S @ G)[0, 0, 0]), rel=1e-3)
     assert found.differentiates
     assert "almost a differentiator" in found.words
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("second", [0.0, 40.0])
+def test_a_channel_without_an_integrator_yields_at_rest(second: float, sampled: bool) -> None:
+    """Two free masses, each with its own controller k (1 + w/s), one of them with `second` for w:
+    by a constant force on that one it moves 1/k where w is 0."""
+    k, turn = 3e4, np.array([[0.6, -0.8], [0.8, 0.6]])
+    A, B = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)), np.vstack([0.0 * turn, 0.2 * turn])
+    G = StateSpace(A, B, np.hstack([turn.T, 0.0 * turn]), np.zeros((2, 2)))
+    K = StateSpace(-1e3 * np.array([[0.0, 0.0], [0.0, 0.0 if second else 1.0]]), np.eye(2),
+                   10.0 * k * np.diag([1.0, 0.1 * second]), k * np.eye(2))  # fmt: skip
+    K = tustin(K, 1e-4) if sampled else K
+    found = statics(G, K, bandwidth=300.0, omega_low=HZ)
+    if second:
+        assert found.compliance == 0.0
+        assert "a constant force does not move the stage" in found.words
+    else:
+        assert found.stiffness == pytest.approx(k, rel=1e-4)
+        assert found.compliance == pytest.approx(1.0 / k, rel=1e-4)
+        assert "Not every channel integrates" in found.words
+        assert "33.3" in found.words
 
 
 def test_an_integrator_is_infinitely_stiff(two_mass_run: Path, tmp_path: Path) -> None:

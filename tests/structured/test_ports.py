@@ -1,12 +1,13 @@
 """Forces where they act, errors where they count: against the dynamic stiffness of the loop."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from ccd_casadi.analysis.loop_figures import compliance_of, force_response
+from ccd_casadi.analysis.loop_figures import compliance_of, force_response, largest_force_step
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
@@ -320,9 +321,14 @@ def test_commands_that_do_not_know_them_say_so(
     [
         ("[[0, 0], [1, 0], [0, 1]]", "[[1, 0, 0]]", "disturbance is .* transpose"),
         ("[[0, 1, 0]]", "[0, 1, 0, 0]", "performance is"),
+        ("[[0, 1, 0]]", "[[0, 0, 0]]", "performance has no entry but 0"),
+        ("[[0, 1, 0]]", "ca.DM(0, 3)", "performance has no entry but 0"),
+        ("[[0, 1, 0]]", "ca.horzcat(0, m, float('nan'))", "performance is not finite"),
+        ("[[0, 0], [1, 0], [0, 1]]", "[0, 0, 0]", "disturbance has no entry but 0"),
+        ("[[0, 0], [1, 0], [0, 1]]", "[0, float('inf'), 0]", "disturbance is not finite"),
     ],
 )
-def test_a_wrong_shape_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_what_is_no_port_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
     problem_in(tmp_path)
     (tmp_path / "plant.py").write_text(PLANT.replace(old, new))
     with pytest.raises(CaseError, match=words):
@@ -335,3 +341,18 @@ def test_the_loop_at_rest_in_the_verdict_is_the_tools(tmp_path: Path) -> None:
     found = survival(loops_of(problem, problem.start, K), S_max=3.0, bandwidth=100.0, omega_low=HZ)
     assert np.isinf(found.statics.stiffness)
     assert found.statics.compliance == pytest.approx(1.0 / 2e5, rel=1e-6)
+
+
+def test_a_step_of_force_names_the_channel_that_counts(tmp_path: Path) -> None:
+    both, counts = "ports = false\nboth = true", 'bandwidth_of = "2"'
+    problem = problem_in(tmp_path, options=both, bandwidth=counts)
+    loops = member_loops(problem, problem.start, controller(2))[:1]
+    found = largest_force_step(loops, 100.0)
+    assert found.pair == "channel 2 by actuator 1"
+
+
+def test_where_no_force_moves_what_counts_its_compliance_is_0(tmp_path: Path) -> None:
+    problem = problem_in(tmp_path)
+    (loop,) = member_loops(problem, problem.start, controller())[:1]
+    assert loop.counted is not None
+    assert replace(loop, counted=0.0 * loop.counted).compliance == 0.0

@@ -172,9 +172,13 @@ def test_a_place_that_exceeds_its_bound_alone_fails_the_judge() -> None:
 @pytest.mark.parametrize("free", [True, False])
 @pytest.mark.parametrize("period", [None, 0.4])
 @pytest.mark.parametrize("integrator", [True, False])
+@pytest.mark.parametrize("skewed", [-0.6, 0.0, 0.6])
 def test_enclosures_hold_what_plants_of_their_boxes_have(
-    free: bool, period: float | None, integrator: bool
+    free: bool, period: float | None, integrator: bool, skewed: float
 ) -> None:
+    """Channels may be differences of sensors: KS is then of the sensors, not of the channels."""
+    U = SENSORS.outputs + skewed * np.array([[0.0, 1.0], [0.0, 0.0]])
+    U = U / np.linalg.norm(U, axis=0)
     rng = np.random.default_rng(5)
     n, count = 3, 120
     omega, rigid = np.array([0.0 if free else 0.4, 1.0, 2.7]), np.array([free, False, False])
@@ -190,7 +194,7 @@ def test_enclosures_hold_what_plants_of_their_boxes_have(
         ratio = np.array([kind is ParameterKind.DAMPING for kind in own.kinds])
         parts.append((own, np.where(ratio, np.log(0.5), rng.normal(0.0, 1.0, len(ratio)))))
     delay, names = 0.3 * (period or 0.0), ("resonance_shift", "damping", "gain")
-    family = SensorFamily(plant, names, tuple(parts), SENSORS.outputs, SENSORS.inputs, limits, 0.3,
+    family = SensorFamily(plant, names, tuple(parts), U, SENSORS.inputs, limits, 0.3,
                           1.0, period, delay)  # fmt: skip
     boxes = _drawn_boxes(rng, count, period)
     with np.errstate(all="ignore"):
@@ -199,7 +203,8 @@ def test_enclosures_hold_what_plants_of_their_boxes_have(
     for k in np.flatnonzero(found.bounded):
         at = boxes.low[:, k] + rng.random(4) * (boxes.high[:, k] - boxes.low[:, k])
         w = {Chart.LOW: at[0], Chart.HIGH: 1.0 / at[0]}.get(boxes.chart[k], at[0] / (period or 1.0))
-        G, free_G, s = _responses(plant, at[1:], w, period, delay)
+        *both, s = _responses(plant, at[1:], w, period, delay)
+        G, free_G = (U.T @ part for part in both)
         K = np.array([[own.response(part, np.array([s]))[0] for own, part in parts]])
         S = {name: abs(value[0]) for name, value in broken(G[None], K[None]).items()}
         counted = w if integrator else max(w, limits.omega_low)
@@ -208,7 +213,7 @@ def test_enclosures_hold_what_plants_of_their_boxes_have(
         true |= {
             "S_MAX": S["load"] / 2.0, "GS": S["actuator"] * abs(free_G[1, 0]),
             "SHAPE": S["load"] / (limits.room(counted / 0.3) * np.sqrt(0.5) * counted / 0.3),
-            "KS": of_KS * S["actuator"] * np.linalg.norm(K),
+            "KS": of_KS * S["actuator"] * np.linalg.norm(K @ U.T),
             "T": of_T * S["actuator"] * abs(K[0, 1] * G[1, 0]),
         }  # fmt: skip
         for name, high, low in zip(found.names, found.highest[:, k], found.lowest[:, k],
