@@ -161,7 +161,9 @@ def statics(
     return Statics(float(gains[-1]), compliance(0.0, K0), float(share), low, omega_low / HZ)
 
 
-def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> str:
+def compliance_words(
+    most: float, at_rest: float, low: float, low_hz: float, *, rounding: float = 1e-9
+) -> str:
     """A sentence of what a force moves.
 
     Parameters
@@ -170,6 +172,8 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
         ‖GS‖∞, GS at rest (0: an integrator) and at the lowest frequency that counts, m/N.
     low_hz : float
         That one, Hz.
+    rounding : float
+        Share of the most up to which what is left at rest is rounding.
 
     Returns
     -------
@@ -182,10 +186,14 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     '2 um/N at most, 0.5 um/N at 1 Hz, none at rest (an integrator)'
     >>> compliance_words(64e-3, 59e-3, 5.5e-3, 1.0)
     '64 mm/N at most, 5.5 mm/N at 1 Hz, 59 mm/N at rest'
+    >>> compliance_words(2e-6, 1e-20, 5e-7, 1.0)
+    '2 um/N at most, 0.5 um/N at 1 Hz, none at rest (an integrator)'
     """
     metres, factor = display_unit(spoken("m"), most)
     unit = f"{metres.replace('µ', 'u')}{spoken('/N')}"  # as the terminal prints it
-    rest = f"{factor * at_rest:.4g} {unit} at rest" if at_rest else "none at rest (an integrator)"
+    rest = "none at rest (an integrator)"
+    if not at_rest <= rounding * most:
+        rest = f"{factor * at_rest:.4g} {unit} at rest"
     at_low = f"{factor * low:.4g} {unit} at {low_hz:.3g} Hz"
     return f"{factor * most:.4g} {unit} at most, {at_low}, {rest}"
 
