@@ -15,6 +15,7 @@ from scipy.optimize import linprog
 
 from ccd_casadi.extensions.drives.cascade_rows import CascadeRows
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
 
 
@@ -110,14 +111,18 @@ class Search(CascadeRows):
             worst = np.argsort(-over)[: o.rows]
             used[worst[over[worst] > o.violated]] = True
 
-    def fastest(self, seed: int = 0) -> Candidate | None:
+    def fastest(self, seed: int = 0, progress: Tell = silent) -> Candidate | None:
         """The best of several starts; None where no start is stable or none meets the bounds."""
         o, rng = self.options, np.random.default_rng(seed)
         starts = [values for _ in range(o.starts) if (values := self.start(rng)) is not None]
         left = [Candidate(values, o.bandwidth * HZ, 0.0) for values in starts]
         others: list[Candidate] = []
-        for share, steps in o.stages:
-            left = [self.climb(one.values, None, steps, one.bandwidth) for one in left]
+        for stage, (share, steps) in enumerate(o.stages, 1):
+            climbed: list[Candidate] = []
+            for number, one in enumerate(left, 1):
+                climbed.append(self.climb(one.values, None, steps, one.bandwidth))
+                progress(f"stage {stage} of {len(o.stages)}: climb {number} of {len(left)}")
+            left = climbed
             left.sort(key=lambda one: max(one.excess, 0.0) * o.penalty - np.log(one.bandwidth))
             left, others = left[: (n := max(1, round(share * len(starts))))], left[n:]
         found = [self.settled(one) for one in left]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, one_line, option, valued
-from ccd_casadi.support.terminal import inform, say
+from ccd_casadi.support.terminal import inform, remark, say
 
 
 @command(
@@ -46,6 +46,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         found = design_drive(
             problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
             seed=options.seed, workers=workers, options=DriveOptions(search=search),
+            progress=lambda words: remark(words, options.quiet),
         )  # fmt: skip
     text = sheet_text(found, today)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")

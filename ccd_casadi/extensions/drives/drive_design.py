@@ -18,6 +18,8 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ, counted
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class DriveDesign:
 
 def design_drive(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, *,
-    seed: int = 0, workers: Pool | None = None, options: DriveOptions = DriveOptions(),
+    seed: int = 0, workers: Pool | None = None, progress: Tell = silent,
+    options: DriveOptions = DriveOptions(),
 ) -> DriveDesign:  # fmt: skip
     """Find the fastest rounded cascade.
 
@@ -103,6 +106,8 @@ def design_drive(
     seed : int
     workers : Pool, optional
         For the judge.
+    progress : callable
+        Takes a line at each step.
     options : DriveOptions
 
     Returns
@@ -116,16 +121,19 @@ def design_drive(
     """
     require_known(bounds)
     points = _first(uncertain)
+    progress(f"searching {options.search.starts} starts on {counted(len(points), 'plant')}")
     search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
-    free = search.fastest(seed)
+    free = search.fastest(seed, progress)
     if free is None:
         words = "no cascade of this drive meets the bounds from any start"
         raise UserError(f"{words}; raise S_max or S_low, or give it more filters")
-    for _ in range(options.rounds):
+    for number in range(1, options.rounds + 1):
+        progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
         rounded = on_the_grid(search, free, options.rounding)
         judged = judge(cascade, rounded.values, uncertain, bounds, sampling, points, seed, workers,
                        options.draws)  # fmt: skip
         band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
+        progress(f"{band / HZ:.4g} Hz on the drive's grid; proving it on the whole set")
         proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
         for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
             if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):
