@@ -12,7 +12,7 @@ bound shows by how much bounds may be wrong: all others are lowered by twice as 
 begin at what it has found.
 
 Where true values are cheap, exchanges give a combination to begin with (`exchange`): its design is
-verified before the first part is split, and cuts from there on.
+judged before the first part is split, and cuts from there on if it is verified.
 
 Source: Land and Doig, Econometrica 28 (1960).
 """

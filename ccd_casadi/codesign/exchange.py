@@ -6,10 +6,10 @@ From the combination that is nearest to an optimum between the values, at the θ
 
 until no exchange lowers J or the time is up. An exchange moves one list to a value beside its own;
 where none of these keeps λ (a number of places is given) two lists move at once. J is true: the
-inner problem is solved at every z', many at once. Branch and bound begins with a design that is
-verified then, and cuts with it.
+inner problem is solved at every z', many at once. Branch and bound then begins with a design that
+is judged, and cuts with it if it is verified.
 
-Source: 1-opt and exchange neighbourhoods of facility location (Cornuejols et al., 1990).
+Source: exchange neighbourhoods of facility location (Cornuejols, Nemhauser and Wolsey, 1990).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -72,13 +72,16 @@ def best_exchange(
         The best combination that was found, and how many were evaluated.
     """
     problem, keeps = sampler.problem, _keeps_constraints(sampler.problem)
-    size = options.batch * sampler.workers.count
+    size, count = options.batch * sampler.workers.count, 0
 
     def evaluated(some: Sequence[Values]) -> list[tuple[tuple[float, float], Values]]:
+        nonlocal count
         points = np.array([_point(problem, theta, one) for one in some])
         found = sampler.values(points, "exchanging listed values")
-        return [(_rank(problem, sample), one) for sample, one in zip(found, some, strict=True)
-                if sample.searched]  # fmt: skip
+        ranked = [(_rank(problem, sample), one) for sample, one in zip(found, some, strict=True)
+                  if sample.searched]  # fmt: skip
+        count += len(ranked)
+        return ranked
 
     def allowed(some: Iterable[Values]) -> list[Values]:
         rows = list(some)
@@ -103,7 +106,7 @@ def best_exchange(
                 if least is not best:
                     best, going = least, True
                     break
-    return (begin if best is None else best[1]), len(tried)
+    return (begin if best is None else best[1]), count
 
 
 def _rank(problem: CoDesignProblem, sample: InnerSample) -> tuple[float, float]:
