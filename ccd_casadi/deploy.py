@@ -15,6 +15,7 @@ from ccd_casadi.support.text import spoken, with_unit
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
+    from ccd_casadi.deployment.on_hardware import OnHardware
     from ccd_casadi.deployment.outcome import Deployment
 
 
@@ -44,6 +45,10 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
     option("--single", action="store_true",
            help="C code in single precision (float), whose rounded coefficients are judged; no "
            "structured text"),
+    option("--fixed", type=int, choices=[16, 32], metavar="BITS",
+           help="C code in integers of 16 or 32 bits, saturating, whose rounded coefficients are "
+           "judged; no structured text. A count of e or u is --sensor-step or --force-step, where "
+           "given"),
     option("--fmu", action="store_true",
            help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
            "names"),
@@ -59,6 +64,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment import source_code
     from ccd_casadi.deployment.deploy_files import DESIGN_FILES, write_files
+    from ccd_casadi.deployment.fixed_point import FixedRequest
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
@@ -70,8 +76,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     write_fmu = extensions.function("fmu") if options.fmu else None
     if options.fmu and write_fmu is None:
         raise UserError(extensions.missing("--fmu", "functions", "fmu"))
-    if options.fmu and options.single:
-        raise UserError("--fmu: is of double precision; drop it, or --single")
+    if options.single and options.fixed:
+        raise UserError("--single, --fixed: the code has one precision; drop one of them")
+    if options.fmu and (options.single or options.fixed):
+        raise UserError("--fmu: is of double precision; drop it, or --single, --fixed")
     finished = read_run(options.run)
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
@@ -96,9 +104,13 @@ def main(options: argparse.Namespace) -> ExitCode:
     )
     reduced = 0 if kind.as_designed else channels
     moved, steps = None, reduced + 2 + (options.saturation is not None)
+    fixed = None
+    if options.fixed:
+        steps_given = options.sensor_step, options.force_step
+        fixed = FixedRequest(options.fixed, move_limits(options), *steps_given)
     with Progress(steps, "deploying") as bar:
         found = deploy(
-            finished, timing, saturation=options.saturation, single=options.single,
+            finished, timing, saturation=options.saturation, single=options.single, fixed=fixed,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
         if found.stable:
@@ -118,7 +130,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
                                   "kind": kind.title}  # fmt: skip
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
-        if structured_text is not None and not options.single:
+        if structured_text is not None and K.precision == "double":
             code = structured_text(K, **naming)
             (folder / source_code.ST_FILE).write_text(code, "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
@@ -126,7 +138,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     finished = with_verdict_line(
         finished, folder, "deployable", deployed_line(finished, found, moved)
     )
-    inform(_summary(finished, found))
+    inform(_summary(finished, found, moved))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words
     from ccd_casadi.reporting.run_verdict import index_of, publish
@@ -145,7 +157,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     return ExitCode.NOT_VERIFIED
 
 
-def _summary(run: "FinishedRun", found: "Deployment") -> str:
+def _summary(run: "FinishedRun", found: "Deployment", moved: "OnHardware | None") -> str:
+    from ccd_casadi.deployment.integer_words import integer_words
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.timing_words import needed_words
@@ -155,6 +168,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     return template("templates/deploy.txt", place_words=place_words).render(
         d=found, status=status_words(run, found), decision=advice(run.result),
         needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
+        integers=integer_words(found.realisation.fixed, found.rounding, moved),
     ).rstrip()  # fmt: skip
 
 

@@ -108,15 +108,14 @@ def move(
     sensors on one actuator that of the first place, with references as of `course`. The error is
     that of the `ports`, where they count something else."""
     hardware = hardware or Electronics()
-    K, T, number = realisation.system, realisation.system.period, realisation.number
-    n, m = len(plant.A), len(K.C)
+    T, n, m = realisation.system.period, len(plant.A), len(realisation.system.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
     wanted, (output, reference) = profile.at(time), course(plant, axis, places)
     ahead = np.zeros((count, m))
     if forward is not None:
         own = forward @ reference if places else forward[:, :, axis]
-        ahead = np.einsum("kt,km->tm", wanted, own)
+        ahead = wanted.T @ own
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
@@ -128,26 +127,18 @@ def move(
     def over(share: float) -> Array:
         return np.asarray(expm(joint * (T * share))[:n])
 
-    x, z, u_now = np.zeros(n), np.zeros(len(K.A), number), np.zeros(m)
+    x, u_now, controller = np.zeros(n), np.zeros(m), running(realisation)
     rows, aim = (output[None] @ plant.C, np.ones(1)) if places else (plant.C, reference)
     if ports is not None:
         rows, aim = ports.counted, ports.wanted[:, 0 if places else axis]
     error, force = np.zeros((count, len(aim))), np.zeros((count, m))
-    A, B, C, D = (M.astype(number) for M in (K.A, K.B, K.C, K.D))
-    limit, gain = realisation.saturation, realisation.back_calculation
-    ahead = ahead.astype(number)
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
         r = reference * wanted[0, k]
         error[k] = aim * wanted[0, k] - rows @ x
-        e = (r - _stepped(y, hardware.sensor_step)).astype(number)
-        v = C @ z + D @ e + ahead[k]
-        u = v if limit is None else np.clip(v, -limit, limit)
-        z = A @ z + B @ e
-        if gain is not None:
-            z = z + gain.astype(number) @ (u - v)
-        clipped += bool(np.any(u != v))
+        u, limited = controller(r - _stepped(y, hardware.sensor_step), ahead[k])
+        clipped += limited
         force[k] = _stepped(u, hardware.force_step)
         now, end = float(k), k + 1.0
         while now < end:  # from one arrival to the next
@@ -160,6 +151,47 @@ def move(
             now = following
     return Move(time, wanted[0], error, force, forward is not None, profile.duration,
                 window, saturated=clipped / count)  # fmt: skip
+
+
+def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, bool]]:
+    """A controller at rest, sample by sample, in the arithmetic of its code.
+
+    Parameters
+    ----------
+    realisation : Realisation
+
+    Returns
+    -------
+    callable
+        Of e (p,) and feedforward (m,): u (m,) in N, and whether something is at its limit.
+    """
+    K, fixed, number = realisation.system, realisation.fixed, realisation.number
+    if fixed is not None:
+        X = fixed.begin([0] * K.B.shape[1], [0] * len(K.C))
+
+        def in_integers(e: Array, f: Array) -> tuple[Array, bool]:
+            nonlocal X
+            words = fixed.counts(e, fixed.errors), fixed.counts(f, fixed.forces)
+            u, X, saturated = fixed.step(X, *words)
+            return np.array(u) * fixed.forces, saturated or fixed.largest in map(abs, words[0])
+
+        return in_integers
+    z = np.zeros(len(K.A), number)
+    A, B, C, D = (M.astype(number) for M in (K.A, K.B, K.C, K.D))
+    limit, given = realisation.saturation, realisation.back_calculation
+    gain = None if given is None else given.astype(number)
+
+    def in_floats(e: Array, f: Array) -> tuple[Array, bool]:
+        nonlocal z
+        e = e.astype(number)
+        v = C @ z + D @ e + f.astype(number)
+        u = v if limit is None else np.clip(v, -limit, limit)
+        z = A @ z + B @ e
+        if gain is not None:
+            z = z + gain @ (u - v)
+        return u, bool(np.any(u != v))
+
+    return in_floats
 
 
 def forward_of(
@@ -273,7 +305,9 @@ def on_hardware(
     profile, K = setpoint(limits), realisation.system
     if hardware is not None:
         hardware.require_in_order(K.period)
-    free = replace(realisation, saturation=None, back_calculation=None)
+    fixed = realisation.fixed
+    free = replace(realisation, saturation=None, back_calculation=None,
+                   fixed=None if fixed is None else fixed.without_limit())  # fmt: skip
     try:
         forward = forward_of(plant, K.period, delay, places)
     except UserError:
@@ -286,7 +320,8 @@ def on_hardware(
     if forward is not None:
         ways[UNLIMITED[1]] = unlimited = made(free, forward=forward)
     if realisation.saturation is not None:
-        clipped = replace(realisation, back_calculation=None)
+        clipped = replace(realisation, back_calculation=None,
+                          fixed=None if fixed is None else fixed.only_clipped())  # fmt: skip
         words = f"limited to {realisation.saturation:.4g} N, only clipped"
         ways[words] = made(clipped, forward=forward)
         ways[BACK] = made(realisation, forward=forward)
@@ -297,7 +332,9 @@ def on_hardware(
         progress("least force")
         least = 1.0
         for share in options.shares:
-            held = with_anti_windup(replace(free, saturation=share * peak), bandwidth)
+            # of integers the same in double precision: their steps are those of the given limit
+            held = replace(free, saturation=share * peak, fixed=None)
+            held = with_anti_windup(held, bandwidth)
             if not np.isfinite(made(held, forward=forward).settled):
                 break
             least = share

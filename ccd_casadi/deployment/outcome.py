@@ -10,6 +10,8 @@ from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deployment.discretise import Conversion, Target
+from ccd_casadi.deployment.integer_loop import RoundingBound
+from ccd_casadi.deployment.integer_words import integer_faults, rounding_words
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import LoopChannel, Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
@@ -82,6 +84,8 @@ class Deployment:
         Of the code's coefficients on the plants as their function returned them.
     designed : Sampling or None
         How the loop was designed to run; None where K(s) was designed.
+    rounding : RoundingBound or None
+        What integers add on the worst plant; None of floating point, and of an unstable loop.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -103,6 +107,7 @@ class Deployment:
     compliance_max: float | None = None
     judge: Judgement | None = None
     designed: Sampling | None = None
+    rounding: RoundingBound | None = None
 
     @property
     def order(self) -> int:
@@ -232,6 +237,7 @@ def deployed_line(
         "plants": 1 + len(found.members),
         "judge": None if found.judge is None else found.judge.entry,
         "move": None if moved is None else moved.limited_entry,
+        "rounding": None if found.rounding is None else found.rounding.largest,
     }
     if found.shortfalls:
         return VerdictLine.of(State.FAILED, (f"{at}: {found.shortfalls[0]}",), figures)
@@ -244,7 +250,11 @@ def deployed_line(
                 f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
             )
     ends = limit_words(figures["move"] or {})
-    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends))]
+    integers = integer_faults(found.rounding, moved)
+    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends,
+                              *integers))]  # fmt: skip
+    if found.rounding is not None and not integers:
+        kept.append(rounding_words(found.rounding))
     if reasons:
         return VerdictLine.of(State.WARNED, (*reasons, *kept), figures)
     return VerdictLine.of(State.PASSED, kept, figures)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.sampled_figures import loop_figures
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.discretise import (
     Conversion,
@@ -17,9 +18,13 @@ from ccd_casadi.deployment.discretise import (
     loop_at,
     loops_meet,
 )
+from ccd_casadi.deployment.fixed_point import FixedRequest, in_fixed
+from ccd_casadi.deployment.integer_loop import ranges_of_moves, rounding_bound
+from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import (
     LoopChannel,
+    Realisation,
     along_directions,
     assemble,
     in_single,
@@ -44,7 +49,7 @@ from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loo
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
 from ccd_casadi.lti.loop import Sampling, sampled
-from ccd_casadi.lti.state_space import closed_loop
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.perturbed import sampled_compliance
@@ -166,10 +171,11 @@ DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_u
 @dataclass(frozen=True)
 class CodeForm:
     """What is required of the code: its largest force in N, and whether it is of single
-    precision."""
+    precision, or of integers."""
 
     saturation: float | None = None
     single: bool = False
+    fixed: FixedRequest | None = None
 
 
 @one_blas_thread
@@ -179,6 +185,7 @@ def deploy(
     *,
     saturation: float | None = None,
     single: bool = False,
+    fixed: FixedRequest | None = None,
     progress: Callable[[str], None] = lambda words: None,
     options: DeploymentOptions = DeploymentOptions(),
 ) -> Deployment:
@@ -194,9 +201,9 @@ def deploy(
         As `read_run` gives it.
     timing : Timing
         Rate and delay, where they are given.
-    saturation, single, progress : float, bool, callable
-        Largest force, N; whether the code computes in single precision, whose rounded coefficients
-        are judged then; takes a line at each step.
+    saturation, single, fixed, progress : float, bool, FixedRequest, callable
+        Largest force, N; whether the code computes in single precision, or in integers, whose
+        rounded coefficients are judged then; takes a line at each step.
     options : DeploymentOptions
         What is kept of the designed loop.
 
@@ -245,7 +252,7 @@ def deploy(
         reduced = assemble(channels, small)
         figures = run.measured(run.plant, reduced)
     way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
-    code = CodeForm(saturation, single)
+    code = CodeForm(saturation, single, fixed)
     if designed is not None:
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
@@ -296,7 +303,8 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     figures = dict(judged.figures)
     if own.weighted_level is not None:
         own = own if own.places else replace(own, channels=())
-        runs = found.realisation.as_coded if found.realisation.single else K
+        rounded = found.realisation.precision != "double"
+        runs = found.realisation.as_coded if rounded else K
         worst = certify(plants, runs, own, sampling, integrator=False).worst
         figures |= {name: worst[name] for name in ("KS", "T")}
     return replace(judged, figures=figures, words=words)
@@ -356,10 +364,13 @@ def _assessed(
     realisation = with_anti_windup(
         realise([o.channel for o in orders], parts, code.saturation), bandwidth
     )
-    realisation = in_single(realisation) if code.single else realisation
-    K, nominal = realisation.system, Perturbation()
+    nominal = Perturbation()
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
     held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
+    if code.fixed is not None:
+        realisation = _of_integers(run, realisation, held[nominal], delay, code.fixed)
+    realisation = in_single(realisation) if code.single else realisation
+    K, fixed = realisation.system, realisation.fixed
     figures = {at: loop_figures(closed_loop(G, K), places) for at, G in held.items()}
     loop = run.loop
     at_rest = statics(loop.plant, K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low,
@@ -375,7 +386,25 @@ def _assessed(
         members=tuple(MemberLoop(at, item) for at, item in figures.items()),
         unverified=unverified, statics=at_rest, compliance_max=most, **way,
     )  # fmt: skip
+    if fixed is not None and found.stable:
+        bounds = [rounding_bound(G, K, fixed) for G in held.values()]
+        found = replace(found, rounding=max(bounds, key=lambda one: one.largest))
     if most is None or not found.stable:
         return found
     gains = {at: sampled_compliance(plants[at], G, K, places) for at, G in held.items()}
     return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))
+
+
+def _of_integers(
+    run: FinishedRun, realisation: Realisation, held: StateSpace, delay: float,
+    request: FixedRequest,
+) -> Realisation:  # fmt: skip
+    """The same in integers whose ranges hold the moves of the nominal loop."""
+    plant, K, places = run.loop.plant, realisation.system, kind_of(run.problem).bounds().places
+    profile, forward = setpoint(request.moves), None
+    try:
+        forward = forward_of(plant, held.period, delay, places)
+    except UserError:
+        pass  # the move is made by feedback alone
+    ranges = ranges_of_moves(plant, held, K, profile, forward, places)
+    return in_fixed(realisation, ranges, request)

@@ -4,7 +4,7 @@ saturates."""
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
@@ -14,6 +14,9 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+
+if TYPE_CHECKING:
+    from ccd_casadi.deployment.fixed_point import FixedPoint
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,8 @@ class Realisation:
 
     With a `saturation` in N every u is clipped to ± it, and the states are corrected by what was
     cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`). `single`: the code
-    computes with numbers of 24 bits, and the coefficients are such (`in_single`).
+    computes with numbers of 24 bits, and the coefficients are such (`in_single`). `fixed`: it
+    computes with these integers, and the coefficients are theirs (`fixed_point.in_fixed`).
     """
 
     system: StateSpace
@@ -121,6 +125,14 @@ class Realisation:
     saturation: float | None = None
     back_calculation: Array | None = None
     single: bool = False
+    fixed: "FixedPoint | None" = None
+
+    @property
+    def precision(self) -> str:
+        """What the code computes with, in words."""
+        if self.fixed is not None:
+            return f"fixed {self.fixed.bits}"
+        return "single" if self.single else "double"
 
     @property
     def number(self) -> type[np.floating[Any]]:
@@ -253,8 +265,18 @@ def difference_equation(
 
     From the state `start`, else from rest. Sums start at zero and run over the states, then the
     inputs, then the feedforward, without fused operations: the result equals that of the C code
-    bit by bit.
+    bit by bit. Of integers e, f, `start` and u are counts.
     """
+    fixed = realisation.fixed
+    if fixed is not None:
+        X = [0] * len(fixed.states) if start is None else [int(x) for x in start]
+        ahead = np.zeros((len(errors), len(fixed.forces))) if forward is None else forward
+        found = []
+        for e, f in zip(np.asarray(errors, int).tolist(), np.asarray(ahead, int).tolist(),
+                        strict=True):  # fmt: skip
+            counts, X, _ = fixed.step(X, e, f)
+            found.append(counts)
+        return np.array(found)
     K, given = realisation.system, realisation.back_calculation
     A, B, C, D = (numbers(realisation, part) for part in (K.A, K.B, K.C, K.D))
     (x,) = numbers(realisation, np.array([np.zeros(len(A)) if start is None else start]))

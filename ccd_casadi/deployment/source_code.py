@@ -60,6 +60,8 @@ def c_files(
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none. `tolerance`, of
     the largest force: what the test accepts, by default 1e-12, of single precision 1e-6.
     """
+    if realisation.fixed is not None:
+        return _fixed_files(realisation, values_of(realisation, title, delay, verified, kind))
     tolerance = tolerance or (1e-6 if realisation.single else 1e-12)
     K, limit = realisation.system, realisation.saturation
     errors, forwards, first, forces = vectors(realisation)
@@ -74,6 +76,28 @@ def c_files(
         "initialiser": lambda entries: f"{{\n    {literals(entries, 4)}\n}}",
     }  # fmt: skip
     return {name: template(f"deployment/templates/{name}").render(values) for name in C_FILES}
+
+
+def _fixed_files(realisation: Realisation, values: Mapping[str, Any]) -> Mapping[str, str]:
+    """The three files of integers."""
+    fixed = realisation.fixed
+    assert fixed is not None
+    errors, forwards, first, forces = vectors(realisation)
+    rows = (*fixed.to_forces, *fixed.to_states, *fixed.at_start)
+
+    named = {
+        "bits": fixed.bits, "guard": fixed.guard, "largest": fixed.largest,
+        "wide": 32 if fixed.bits + fixed.guard <= 32 else 64,
+        "rate": f"{1.0 / realisation.system.period:.10g}",
+        "rows": rows, "limits": fixed.limits,
+        "ends": [sum(map(len, rows[:i])) for i in range(len(rows) + 1)],
+        "error_steps": fixed.errors.tolist(), "force_steps": fixed.forces.tolist(),
+        "compile": COMPILE, "samples": len(errors), "errors": errors.ravel(),
+        "forwards": forwards.ravel(), "first": first, "forces": forces.ravel(),
+        "integers": lambda entries: "{" + ", ".join(str(int(x)) for x in entries) + "}",
+    }  # fmt: skip
+    return {name: template(f"deployment/templates/fixed_{name}").render({**values, **named})
+            for name in C_FILES}  # fmt: skip
 
 
 def values_of(
@@ -99,6 +123,15 @@ def vectors(
     """
     K, limit = realisation.system, realisation.saturation
     rng = np.random.default_rng(0)
+    fixed = realisation.fixed
+    if fixed is not None:  # the whole range of a word, so that every limit is met
+        sizes = (samples, K.B.shape[1]), (samples, len(K.C)), len(K.C)
+        draws = [rng.integers(-fixed.largest, fixed.largest + 1, size) for size in sizes]
+        for draw in draws[:2]:  # and small ones, which move the last bits alone
+            draw[: samples // 2] //= fixed.largest // 100
+        began = fixed.begin(draws[0][0].tolist(), draws[2].tolist())
+        words, ahead, held = (draw.astype(float) for draw in draws)
+        return words, ahead, held, difference_equation(realisation, words, ahead, began)
     errors = error * rng.standard_normal((samples, K.B.shape[1]))
     size = limit if limit is not None else error * float(np.abs(K.D).max() + 1.0)
     forwards = size * rng.standard_normal((samples, len(K.C)))

@@ -1,0 +1,178 @@
+"""A loop whose controller computes in integers: what its signals need, and what rounding adds.
+
+Without saturation the loop is linear, and all that integers add are bounded signals: counts of e,
+u and f are rounded, a state is used without its guard bits, a term loses a fraction. The sum over
+all samples of every response to them, times their largest values, bounds what they can move the
+sensors: for ever, for any course, limit cycles included.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
+from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
+from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True)
+class ResponseSumOptions:
+    """Numbers of a sum over an impulse response.
+
+    Attributes
+    ----------
+    block : int
+        Samples at once.
+    share : float
+        Of the sum, that the rest may be.
+    most : int
+        Blocks at most; beyond them nothing is known.
+    """
+
+    block: int = 256
+    share: float = 1e-3
+    most: int = 20_000
+
+
+@dataclass(frozen=True)
+class RoundingBound:
+    """What rounding adds.
+
+    Attributes
+    ----------
+    bits, errors : int, array (p,)
+        Of a word; largest movement of each sensor, its unit. Infinite where it is not known.
+    """
+
+    bits: int
+    errors: Array
+
+    @property
+    def largest(self) -> float:
+        """Of the first sensor, which a move is of."""
+        return float(self.errors[0])
+
+
+def ranges_of_moves(
+    plant: StateSpace, held: StateSpace, K: StateSpace, profile: Setpoint,
+    forward: Array | None, places: Sequence[BreakPoint] = (),
+) -> Ranges:  # fmt: skip
+    """Largest values in moves of every axis, with feedforward where there is one and without.
+
+    Parameters
+    ----------
+    plant, held : StateSpace
+        u to y in SI, and the same behind hold and delay.
+    K : StateSpace
+        As it runs, SI.
+    profile : Setpoint
+    forward : (5, m, p) array or None
+    places : sequence of BreakPoint
+        Of several sensors on one actuator.
+
+    Returns
+    -------
+    Ranges
+    """
+    n, p, m = len(K.A), K.B.shape[1], len(K.C)
+    count = int(np.ceil(2.0 * profile.duration / held.period))
+    wanted = profile.at(np.arange(count, dtype=float) * held.period)
+    peaks = np.zeros(n + p + m)
+    for axis in range(1 if places else p):
+        reference = course(plant, axis, places)[1]
+        ways = [np.zeros((count, m))]
+        if forward is not None:
+            ways.append(wanted.T @ forward_gains(forward, reference, axis, places))
+        for ahead in ways:
+            x, z = np.zeros(len(held.A)), np.zeros(n)
+            for r, f in zip(wanted[0], ahead, strict=True):
+                e = reference * r - held.C @ x
+                u = K.C @ z + K.D @ e + f
+                peaks = np.maximum(peaks, np.abs(np.concatenate([z, e, u])))
+                x, z = held.A @ x + held.B @ u, K.A @ z + K.B @ e
+    return Ranges(peaks[:n], peaks[n : n + p], peaks[n + p :])
+
+
+def forward_gains(
+    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
+) -> Array:
+    """Feedforward of a setpoint's position and derivatives.
+
+    Parameters
+    ----------
+    forward : (5, m, p) array
+    reference : array (p,)
+        As of `course`.
+    axis : int
+    places : sequence of BreakPoint
+
+    Returns
+    -------
+    array (5, m)
+    """
+    return np.asarray(forward @ reference if places else forward[:, :, axis])
+
+
+def rounding_bound(
+    held: StateSpace, K: StateSpace, fixed: FixedPoint,
+    options: ResponseSumOptions = ResponseSumOptions(),
+) -> RoundingBound:  # fmt: skip
+    """Bound what the integers move the sensors on one plant.
+
+    Parameters
+    ----------
+    held : StateSpace
+        Plant behind hold and delay.
+    K : StateSpace
+        Of the integers, SI.
+    fixed : FixedPoint
+    options : ResponseSumOptions
+
+    Returns
+    -------
+    RoundingBound
+    """
+    loop = closed_loop(held, K)
+    n, k = len(held.A), len(K.A)
+    states, count = fixed.states, 2.0**-fixed.guard
+    at_e = loop.B_r * fixed.errors
+    at_u = np.vstack([held.B, np.zeros((k, held.B.shape[1]))])
+    # of X: the count that is cut off moves u and the next X by what it would have
+    used = np.vstack([held.B @ K.C, K.A - np.eye(k)]) * states
+    lost_u = np.array([_fractions(row) for row in fixed.to_forces]) * count
+    lost_x = np.array([_fractions(row) for row in fixed.to_states]) * count * states
+    sources = np.hstack([
+        0.5 * at_e, at_u * fixed.forces * (1.0 + lost_u), used,
+        np.vstack([np.zeros((n, k)), np.diag(lost_x)]),
+    ])  # fmt: skip
+    return RoundingBound(fixed.bits, _summed(loop.A, sources, loop.C_y, options))
+
+
+def _fractions(row: Sequence[Term]) -> int:
+    return sum(term.shift > 0 for term in row)
+
+
+def _summed(A: Array, B: Array, C: Array, options: ResponseSumOptions) -> Array:
+    """Σ_k |C A^k B| over all k and columns (p,)."""
+    if not np.abs(np.linalg.eigvals(A)).max(initial=0.0) < 1.0:
+        return np.full(len(C), np.inf)
+    rows, last = [C], C
+    for _ in range(options.block - 1):
+        last = last @ A
+        rows.append(last)
+    block, jump = np.vstack(rows), np.linalg.matrix_power(A, options.block)
+    total, before = np.zeros(len(C)), np.full(len(C), np.inf)
+    for _ in range(options.most):
+        part = np.abs(block @ B).sum(axis=1).reshape(options.block, len(C)).sum(axis=0)
+        total = total + part
+        ratio = part / np.maximum(before, np.finfo(float).tiny)
+        # two blocks that fall alike: the rest falls at least as a series of their ratio
+        rest = np.where(ratio < 1.0, part * ratio / np.maximum(1.0 - ratio, options.share), np.inf)
+        if (rest <= options.share * total).all():
+            return np.asarray(total + rest)
+        before, B = part, jump @ B
+    return np.full(len(C), np.inf)

@@ -1,0 +1,75 @@
+"""What integers of a deployed controller are, add and may spoil, in words."""
+
+from math import isfinite
+
+from ccd_casadi.deployment.fixed_point import FixedPoint
+from ccd_casadi.deployment.integer_loop import RoundingBound
+from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware
+from ccd_casadi.support.text import spoken, with_unit
+
+
+def rounding_words(found: RoundingBound) -> str:
+    """What integers add.
+
+    Parameters
+    ----------
+    found : RoundingBound
+
+    Returns
+    -------
+    str
+    """
+    if not isfinite(found.largest):
+        return f"no bound was found of what rounding to {found.bits} bits adds"
+    most = with_unit(found.largest, spoken("m"))
+    return f"rounding to {found.bits} bits moves y by {most} at most"
+
+
+def integer_words(
+    fixed: FixedPoint | None, rounding: RoundingBound | None, moved: OnHardware | None
+) -> tuple[str, ...]:
+    """What the integers of the code are, what they add, and what they may spoil.
+
+    Parameters
+    ----------
+    fixed, rounding, moved : FixedPoint, RoundingBound, OnHardware or None
+
+    Returns
+    -------
+    tuple of str
+        Lines; empty of floating point.
+    """
+    if fixed is None:
+        return ()
+    counts = [
+        f"{name} {' and '.join(f'{step:.3g}' for step in dict.fromkeys(steps.tolist()))} {unit}"
+        for name, steps, unit in (("e", fixed.errors, "m"), ("u", fixed.forces, "N"))
+    ]
+    count = spoken(f"a count of {', of '.join(counts)}")
+    first = f"{fixed.bits} bits, saturating; {count}; coefficients judged as rounded"
+    faults = integer_faults(rounding, moved)
+    added = () if faults or rounding is None else (rounding_words(rounding),)
+    return first, *added, *faults
+
+
+def integer_faults(rounding: RoundingBound | None, moved: OnHardware | None) -> tuple[str, ...]:
+    """What integers may spoil: a move that saturates a word, roundings that leave its window.
+
+    Parameters
+    ----------
+    rounding, moved : RoundingBound, OnHardware or None
+
+    Returns
+    -------
+    tuple of str
+    """
+    if rounding is None or moved is None:
+        return ()
+    parts = []
+    if not rounding.largest <= moved.window:
+        window = with_unit(moved.window, spoken("m"))
+        parts.append(f"{rounding_words(rounding)}, and a move has to end within {window}")
+    full = [name for name, move in moved.ways.items() if name in UNLIMITED and move.saturated]
+    if full:
+        parts.append(f"a move saturates words of {rounding.bits} bits ({full[0]})")
+    return tuple(parts)
