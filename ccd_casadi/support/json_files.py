@@ -14,7 +14,8 @@ from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hin
 import numpy as np
 import scipy
 
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import MissingPackage, UserError
+from ccd_casadi.support.mat_hdf5 import hdf5_variables
 from surrogates.files import write_whole
 
 
@@ -42,7 +43,11 @@ def mat_variables(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
     except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
-        raise UserError(f"{path}: is a MATLAB 7.3 file; write it with save(…, '-v7')") from None
+        try:
+            return hdf5_variables(path)
+        except MissingPackage as error:
+            raise UserError(f"{path}: is a MATLAB 7.3 file: {error}; or write it with save(…, "
+                            "'-v7')") from None  # fmt: skip
     except Exception as error:  # a damaged file fails anywhere inside the reader
         words = " ".join(str(error).split())[:120]
         raise UserError(f"{path}: is not a readable .mat file: {words}") from None

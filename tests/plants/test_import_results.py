@@ -14,8 +14,8 @@ import pytest
 
 from ccd_casadi.extensions.imported.imported_command import main
 from ccd_casadi.extensions.imported.interpolation import InterpolatedModes
-from ccd_casadi.extensions.imported.matrices import ResultModes, read_modes
 from ccd_casadi.extensions.imported.modal_table import read_modal_table
+from ccd_casadi.extensions.imported.result_files import ResultModes, read_modes
 
 DATA = Path(__file__).parents[1] / "data" / "calculix"
 MIDDLE, ENDS = (2, 3, 6, 7), (1, 4, 5, 8)
@@ -117,7 +117,7 @@ def test_the_summary_says_what_was_written(
     ("file", "old", "new", "words"),
     [
         ("index.csv", "beam_10.frd", "beam_11.frd", "beam_11.frd: cannot be read"),
-        ("index.csv", "beam_10.frd", "beam.op2", "is not a .frd (CalculiX) or .f06 (Nastran)"),
+        ("index.csv", "beam_10.frd", "beam.odb", "is not a result file that is read: .frd"),
         ("index.csv", "results", "file", "has neither a column results nor"),
         ("index.csv", "0.01", "light", "damping: 'light' is not a number"),
         ("dofs.csv", "in,force,1,z", "in,force,99,z", "node: 99 has no displacements"),

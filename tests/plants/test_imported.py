@@ -335,7 +335,7 @@ def test_static_correction_restores_the_compliance_that_truncation_loses() -> No
         ("dofs.csv", "kind,name,dof\nin,u,5000\nout,y,0\n", "5000 is not a row of a matrix of 50"),
         ("dofs.csv", "kind,name,dof\nin,u,0\n", "names no out"),
         ("dofs.csv", "kind,name,dof\nforce,u,0\n", "needs the columns kind"),
-        ("M00.mtx", "nonsense", "M00.mtx: cannot be read"),
+        ("M00.mtx", "nonsense", "M00.mtx: is neither Matrix Market nor"),
         ("M00.mtx", "%%MatrixMarket matrix coordinate real general\n2 2 1\n1 2 3.0\n",
          "is not symmetric"),
         ("M01.npz", "nonsense", "M01.npz: cannot be read"),

@@ -1,23 +1,21 @@
 """Matrices and result files of finite-element programs at samples of θ."""
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, mmread
 from scipy.linalg import eigh, qr
-from scipy.sparse import csc_array, issparse
-from scipy.sparse import load_npz as load_sparse
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import eigsh, splu
 
+from ccd_casadi.extensions.imported.matrix_files import DIRECTIONS, NodeRows, read_matrix
 from ccd_casadi.extensions.imported.modal_table import ModalTable, Rows, number_in, read_rows
+from ccd_casadi.extensions.imported.result_files import ResultModes, read_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 COLUMNS = ("kind", "name", "dof", "gain")
+RESULT_COLUMNS = ("kind", "name", "node", "direction", "gain")
 KNOWN = ("mass", "stiffness", "results", "damping", "hardware_cost")  # of index.csv: no θ
 
 
@@ -45,19 +43,24 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
         A file is missing, foreign, not symmetric or of another size than the others.
     """
     index = read_index(folder, "mass", "stiffness", "damping")
-    dofs = read_dofs(folder, COLUMNS)
+    dofs = read_dofs(folder, COLUMNS, RESULT_COLUMNS)
     if modes < 1:
         raise PlantError(f"modes = {modes}; keep at least 1")
     found, bases = [], []
     for row in index.values():
-        M, K = (_matrix(folder / row[key]) for key in ("mass", "stiffness"))
+        (M, rows), (K, other) = (read_matrix(folder, row[key], key)
+                                 for key in ("mass", "stiffness"))  # fmt: skip
         if M.shape != K.shape:
             raise PlantError(f"{folder / row['mass']}: is {M.shape}, stiffness {K.shape}")
-        B, C = (_selected(folder, dofs, kind, M.shape[0]) for kind in ("in", "out"))
+        if rows is not None and other is not None and rows != other:
+            words = "its degrees of freedom are not those of the stiffness"
+            raise PlantError(f"{folder / row['mass']}: {words}; write both of one step")
+        at = rows if rows is not None else other
+        B, C = (_selected(folder, dofs, kind, M.shape[0], at) for kind in ("in", "out"))
         extra = np.hstack([B, C]) if static_correction else None
         omega, basis = modes_of(M, K, modes, extra)
         found.append((omega, basis.T @ B, basis.T @ C))
-        bases.append(basis)
+        bases.append((basis, at))
     shapes = _shape_values(folder, dofs, bases)
     modes_each = [(*one, own) for one, own in zip(found, shapes, strict=True)]
     return table_of_samples(folder, index, dofs, modes_each)
@@ -107,7 +110,7 @@ def modes_of(
     """
     n = M.shape[0]
     if n <= 3 * count + 20:
-        lam, basis = eigh(K.toarray(), M.toarray())
+        lam, basis = _dense_modes(M.toarray(), K.toarray(), shift)
         lam, basis = lam[:count], basis[:, :count]
     else:
         shift *= float(K.diagonal().max() / M.diagonal().max())
@@ -128,13 +131,35 @@ def modes_of(
     return np.sqrt(np.maximum(lam, 0.0)), basis
 
 
+def _dense_modes(
+    M: Array, K: Array, shift: float, *, massless: float = 1e-12
+) -> tuple[Array, Array]:
+    """All modes with mass; motions without follow statically. Raises PlantError where one has
+    neither mass nor stiffness."""
+    try:
+        lam, basis = eigh(K, M)
+        return lam, basis
+    except np.linalg.LinAlgError:  # motions without mass, as of a superelement
+        pass
+    shift *= float(K.diagonal().max() / M.diagonal().max())
+    try:
+        mu, basis = eigh(M, K + shift * M)
+    except np.linalg.LinAlgError:
+        empty = int(np.argmin(K.diagonal() + shift * M.diagonal()))
+        words = f"the matrices leave a motion without mass and stiffness, as of row {empty}"
+        raise PlantError(f"{words}; leave it out") from None
+    order = np.argsort(-mu)[: int((mu > massless * mu.max()).sum())]
+    return 1.0 / mu[order] - shift, basis[:, order]
+
+
 def _shape_values(
-    folder: Path, dofs: Rows, bases: list[Array], *, per_mode: int = 2
+    folder: Path, dofs: Rows, reduced: list[tuple[Array, NodeRows | None]], *, per_mode: int = 2
 ) -> list[Array]:
     """Shapes at the dofs named for it; else, on one mesh, at the `per_mode` times the number of
     modes rows that distinguish these best."""
     if any(row["kind"] == "shape" for row in dofs.values()):
-        return [basis.T @ _selected(folder, dofs, "shape", len(basis)) for basis in bases]
+        return [own.T @ _selected(folder, dofs, "shape", len(own), at) for own, at in reduced]
+    bases = [basis for basis, _ in reduced]
     if len({len(basis) for basis in bases}) > 1:
         return [np.zeros((basis.shape[1], 0)) for basis in bases]
     _, _, pivots = qr(bases[0].T, mode="economic", pivoting=True)
@@ -142,18 +167,35 @@ def _shape_values(
     return [basis[rows].T for basis in bases]
 
 
-def _selected(folder: Path, dofs: Rows, kind: str, size: int) -> Array:
+def _selected(folder: Path, dofs: Rows, kind: str, size: int, at: NodeRows | None) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
     names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
     for place, row in dofs.items():
         if row["kind"] == kind:
-            dof, gain = number_in(place, "dof", row["dof"]), number_in(place, "gain", row["gain"])
+            gain = number_in(place, "gain", row["gain"])
+            if "node" in row:
+                found[_row_of(place, row, at), names.index(row["name"])] += gain
+                continue
+            dof = number_in(place, "dof", row["dof"])
             if dof != int(dof) or not 0 <= dof < size:
                 words = f"{dof:g} is not a row of a matrix of {size}; count from 0"
                 raise PlantError(f"{place}: dof: {words}")
             found[int(dof), names.index(row["name"])] += gain
     return found
+
+
+def _row_of(place: str, row: Mapping[str, str], at: NodeRows | None) -> int:
+    """The row of a matrix by node and direction. Raises PlantError where it has none."""
+    if at is None:
+        words = "these matrices do not name nodes; give the column dof instead"
+        raise PlantError(f"{place}: node: {words}")
+    node = int(number_in(place, "node", row["node"]))
+    if (node, row["direction"]) not in at:
+        words = f"{row['direction']} of node {node} is not in the matrices"
+        there = [direction for own, direction in at if own == node]
+        raise PlantError(f"{place}: {words}; it has {', '.join(there) or 'no such node'}")
+    return at[node, row["direction"]]
 
 
 def names_of_kind(folder: Path, dofs: Rows, kind: str) -> tuple[str, ...]:
@@ -164,50 +206,13 @@ def names_of_kind(folder: Path, dofs: Rows, kind: str) -> tuple[str, ...]:
     return names
 
 
-def _matrix(path: Path, *, symmetric: float = 1e-9) -> csc_array:
-    """A real symmetric matrix from .mtx, .npz (sparse, or one array) or .mat (one matrix)."""
-    try:
-        if path.suffix == ".mtx":
-            value = mmread(path)
-        elif path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                value = load_sparse(path) if "format" in file else _only(path, file)
-        elif path.suffix == ".mat":
-            held = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-            value = _only(path, held)
-        else:
-            raise PlantError(f"{path}: is not a .mtx, .npz or .mat; save the matrix as one of them")
-    except PlantError:
-        raise
-    except Exception as error:  # whatever a reader makes of a damaged or foreign file
-        words = " ".join(str(error).split())[:200]
-        raise PlantError(f"{path}: cannot be read: {words}; save the matrix again") from None
-    try:
-        matrix = csc_array(value if issparse(value) else np.asarray(value), dtype=float)
-    except (ValueError, TypeError) as error:
-        raise PlantError(f"{path}: is not a real matrix: {error}") from None
-    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise PlantError(f"{path}: is {matrix.shape}, not square; save the whole matrix")
-    if not np.isfinite(matrix.data).all() or not matrix.nnz:
-        raise PlantError(f"{path}: is empty or not finite; save the matrix again")
-    gap = abs(matrix - matrix.T)
-    if gap.max() > symmetric * abs(matrix).max():
-        raise PlantError(f"{path}: is not symmetric; save both triangles")
-    return matrix
-
-
-def _only(path: Path, held: Mapping[str, Any]) -> Any:
-    if len(held) != 1:
-        raise PlantError(f"{path}: holds {', '.join(held) or 'nothing'}; save one matrix")
-    return next(iter(held.values()))
-
-
-def read_dofs(folder: Path, columns: Sequence[str]) -> Rows:
-    """The rows of dofs.csv (gain: 1 where missing). Raises PlantError where it has others."""
-    path = folder / "dofs.csv"
+def read_dofs(folder: Path, *either: Sequence[str]) -> Rows:
+    """The rows of dofs.csv (gain: 1 where missing), of `either` columns. Raises PlantError where it
+    has others."""
+    path, columns = folder / "dofs.csv", either[0]
     found = {place: {"gain": "1"} | row for place, row in read_rows(path).items()}
     for row in found.values():
-        if set(row) != set(columns) or row["kind"] not in ("in", "out", "shape"):
+        if set(row) not in map(set, either) or row["kind"] not in ("in", "out", "shape"):
             words = f"needs the columns {', '.join(columns)}, kind one of in, out, shape"
             raise PlantError(f"{path}: {words}; see docs/own_finite_elements.md")
     return found
@@ -239,27 +244,13 @@ def read_index(folder: Path, *columns: str) -> Rows:
     return found
 
 
-DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-RESULT_COLUMNS = ("kind", "name", "node", "direction", "gain")
-_VALUE = re.compile(r"[-+]?\d*\.\d+(?:[EeDd]?[-+]\d+)?")
-_VECTOR = re.compile(r"R E A L   E I G E N V E C T O R   N O \.\s+(\d+)")
-
-
-@dataclass(frozen=True)
-class ResultModes:
-    """frequency_hz (r,), and the mass-normalised displacements (r, 6) of each node."""
-
-    frequency_hz: Array
-    displacements: Mapping[int, Array]
-
-
 def results_table(folder: Path) -> ModalTable:
     """Read the modal table of a folder of result files.
 
     Parameters
     ----------
     folder : Path
-        With index.csv, dofs.csv and the result files (.frd, .f06).
+        With index.csv, dofs.csv and the result files.
 
     Returns
     -------
@@ -278,85 +269,6 @@ def results_table(folder: Path) -> ModalTable:
         for one in found
     ]
     return table_of_samples(folder, index, dofs, modes)
-
-
-def read_modes(path: Path) -> ResultModes:
-    """The modes in a .frd or .f06 file. Raises PlantError where there are none."""
-    readers = {".frd": _frd, ".f06": _f06}
-    if path.suffix.lower() not in readers:
-        raise PlantError(f"{path}: is not a .frd (CalculiX) or .f06 (Nastran); name one of these")
-    try:
-        lines = path.read_text(encoding="latin-1").splitlines()
-    except OSError as error:
-        raise PlantError(f"{path}: cannot be read: {error.strerror}; name a result file") from None
-    try:
-        frequencies, masses, vectors = readers[path.suffix.lower()](lines)
-    except (ValueError, IndexError, KeyError) as error:
-        raise PlantError(f"{path}: is damaged: {error}; run the analysis again") from None
-    counts = {len(vector) for vector in vectors}
-    if not vectors or len(frequencies) < len(vectors) or len(counts) != 1 or counts == {0}:
-        raise PlantError(
-            f"{path}: holds no eigenvectors of one set of nodes; ask the program to print them "
-            "(CalculiX: *NODE FILE U; Nastran: VECTOR(PRINT) = ALL)"
-        )
-    order = np.argsort(frequencies[: len(vectors)], kind="stable")
-    scale = 1.0 / np.sqrt(np.array(masses)[order])
-    nodes = vectors[0].keys()
-    shapes = {n: np.array([vectors[i][n] for i in order]) * scale[:, None] for n in nodes}
-    return ResultModes(np.array(frequencies)[order], shapes)
-
-
-def _frd(lines: list[str]) -> tuple[list[float], list[float], list[dict[int, Array]]]:
-    """Displacement blocks that carry a mode: `100C` line, `-4 DISP`, ` -1` rows of fixed width."""
-    frequencies: list[float] = []
-    vectors: list[dict[int, Array]] = []
-    frequency, reading, mode = 0.0, False, False
-    for line in lines:
-        if line.startswith("    1PMODE"):
-            mode = True
-        elif line.startswith("  100C"):
-            frequency = float(line[12:24])
-        elif line.startswith(" -4"):
-            reading = mode and line.split()[1] == "DISP"
-            if reading:
-                frequencies.append(frequency)
-                vectors.append({})
-        elif line.startswith(" -3"):
-            reading = mode = False
-        elif reading and line.startswith(" -1"):
-            values = [float(line[13 + 12 * k : 25 + 12 * k]) for k in range(3)]
-            vectors[-1][int(line[3:13])] = np.array([*values, 0.0, 0.0, 0.0])
-    return frequencies, [1.0] * len(frequencies), vectors
-
-
-def _f06(lines: list[str]) -> tuple[list[float], list[float], list[dict[int, Array]]]:
-    """The table of real eigenvalues, and the blocks of real eigenvectors over all pages."""
-    frequencies: list[float] = []
-    masses: list[float] = []
-    vectors: dict[int, dict[int, Array]] = {}
-    table, block = False, None
-    for line in lines:
-        words = line.split()
-        found = _VECTOR.search(line)
-        if "R E A L   E I G E N V A L U E S" in line:
-            table, block = True, None
-        elif found is not None:
-            table, block = False, vectors.setdefault(int(found.group(1)), {})
-        elif line.startswith("1"):  # a new page; its banner says what goes on
-            table, block = False, None
-        elif table and len(words) == 7 and words[0].isdigit() and words[1].isdigit():
-            frequencies.append(_float(words[4]))
-            masses.append(_float(words[5]))
-        elif block is not None and len(words) > 2 and words[0].isdigit() and words[1] == "G":
-            values = _VALUE.findall(line)
-            block[int(words[0])] = np.array([_float(value) for value in values[:6]])
-    return frequencies, masses, [vectors[i] for i in sorted(vectors)]
-
-
-def _float(text: str) -> float:
-    """Fortran's numbers: 1.0E+00, 1.0D+00 and 1.0-3."""
-    text = re.sub("[Dd]", "E", text)
-    return float(re.sub(r"(?<=[\d.])([-+])", r"E\1", text) if "E" not in text.upper() else text)
 
 
 def _picked(dofs: Rows, kind: str, modes: ResultModes) -> Array:

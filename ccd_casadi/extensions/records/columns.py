@@ -1,11 +1,13 @@
-"""Columns of a log by name: from CSV, .npz, .mat and WAV files, as numbers over samples."""
+"""Columns of a log by name: from text and binary files, as numbers over samples."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ccd_casadi.extensions.records.signal_names import unit_factor
+from ccd_casadi.extensions.records.tdms import tdms_columns
+from ccd_casadi.extensions.records.twincat import is_scope, scope_columns
 from ccd_casadi.plants.table_columns import npz_arrays, texts_of
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.json_files import mat_variables
@@ -29,7 +31,7 @@ def read_columns(path: Path) -> tuple[Columns, float | None, list[str]]:
     Parameters
     ----------
     path : Path
-        .npz, .mat, .wav, or a text table with a header.
+        Of FORMATS, or a text table with a header.
 
     Returns
     -------
@@ -45,12 +47,28 @@ def read_columns(path: Path) -> tuple[Columns, float | None, list[str]]:
         The file cannot be read, or holds no columns of equal length.
     """
     suffix = path.suffix.lower()
-    if suffix == ".wav":
-        return _of_wav(path)
-    if suffix not in (".npz", ".mat"):
-        columns, notes = _of_text(path)
-        return columns, None, notes
-    content = npz_arrays(path) if suffix == ".npz" else _one_struct(mat_variables(path))
+    columns, rate, notes = FORMATS.get(suffix, _of_text)(path)
+    if not columns:
+        raise UserError(f"{path}: holds no signals; give t, the excitation, the force and position")
+    lengths = {len(values) for values in columns.values()}
+    if len(lengths) > 1:
+        each = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
+        raise UserError(f"{path}: its signals have different lengths: {each}; give them one length")
+    return columns, rate, notes
+
+
+Read = tuple[Columns, float | None, list[str]]
+
+
+def _of_npz(path: Path) -> Read:
+    return _of_arrays(path, npz_arrays(path))
+
+
+def _of_mat(path: Path) -> Read:
+    return _of_arrays(path, _one_struct(mat_variables(path)))
+
+
+def _of_arrays(path: Path, content: Mapping[str, np.ndarray]) -> Read:
     columns, rate = dict[str, np.ndarray](), None
     for name, value in content.items():
         numbers = np.asarray(value)
@@ -65,12 +83,6 @@ def read_columns(path: Path) -> tuple[Columns, float | None, list[str]]:
         else:
             raise UserError(f"{path}: {name}: {numbers.shape} is not one signal; give each signal "
                             "as its own array")  # fmt: skip
-    if not columns:
-        raise UserError(f"{path}: holds no signals; give t, the excitation, the force and position")
-    lengths = {len(values) for values in columns.values()}
-    if len(lengths) > 1:
-        each = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
-        raise UserError(f"{path}: its signals have different lengths: {each}; give them one length")
     return columns, rate, []
 
 
@@ -92,7 +104,7 @@ def _stated_rate(path: Path, name: str, value: float) -> float | None:
     return value if known in RATES else 1.0 / value
 
 
-def _of_wav(path: Path) -> tuple[Columns, float | None, list[str]]:
+def _of_wav(path: Path) -> Read:
     from scipy.io import wavfile  # slow to import, and few logs are sound
 
     try:
@@ -108,8 +120,11 @@ def _of_wav(path: Path) -> tuple[Columns, float | None, list[str]]:
     return {str(i): own for i, own in enumerate(table.T, 1)}, float(rate), notes
 
 
-def _of_text(path: Path) -> tuple[Columns, list[str]]:
+def _of_text(path: Path) -> Read:
     text, notes = text_of(path)
+    if is_scope(text):
+        channels, own = scope_columns(path, text)
+        return channels, None, [*notes, *own]
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip(" \t,;|")]
     if not lines:
         raise UserError(f"{path}: is empty; it needs a header and lines of numbers")
@@ -139,7 +154,7 @@ def _of_text(path: Path) -> tuple[Columns, list[str]]:
         raise UserError(f"{path}: column {twice!r} is there twice; keep one")
     body = lines[first:]
     found = _numbers(path, body, mark, comma, len(names))
-    return dict(zip(names, found.T, strict=True)), notes
+    return dict(zip(names, found.T, strict=True)), None, notes
 
 
 def _numbers(
@@ -161,3 +176,8 @@ def _numbers(
         for cell in row:
             number_in(path, i, cell, comma)
     raise UserError(f"{path}: is not a table of real numbers with a header of names")
+
+
+FORMATS: Mapping[str, Callable[[Path], Read]] = {
+    ".npz": _of_npz, ".mat": _of_mat, ".wav": _of_wav, ".tdms": tdms_columns,
+}  # fmt: skip
