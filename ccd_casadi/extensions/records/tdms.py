@@ -30,7 +30,7 @@ def tdms_columns(path: Path) -> tuple[dict[str, np.ndarray], float | None, list[
     """
     nptdms = require("nptdms", "tdms")
     try:
-        with nptdms.TdmsFile.open(str(path)) as file:
+        with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
             every = [one for group in file.groups() for one in group.channels()]
             read = [(one, np.asarray(one[:])) for one in every]
     except OSError as error:
