@@ -72,7 +72,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
-    structured_text = extensions.function("structured_text")
+    structured_text, plcopen_xml = map(extensions.function, ("structured_text", "plcopen_xml"))
     write_fmu = extensions.function("fmu") if options.fmu else None
     if options.fmu and write_fmu is None:
         raise UserError(extensions.missing("--fmu", "functions", "fmu"))
@@ -122,7 +122,8 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FMU_FILE):
+    formats = source_code.ST_FILE, source_code.XML_FILE, source_code.FMU_FILE
+    for name in (*DESIGN_FILES, *source_code.C_FILES, *formats):
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
@@ -133,6 +134,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         if structured_text is not None and K.precision == "double":
             code = structured_text(K, **naming)
             (folder / source_code.ST_FILE).write_text(code, "utf-8")
+            if plcopen_xml is not None:
+                (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(

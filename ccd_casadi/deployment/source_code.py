@@ -24,7 +24,8 @@ COMPILE = (
     "-o controller_test controller.c controller_test.c"
 )
 C_FILES = ("controller.h", "controller.c", "controller_test.c")
-ST_FILE, FMU_FILE = "controller.st", "controller.fmu"  # of the extension `formats`
+# of the extension `formats`
+ST_FILE, XML_FILE, FMU_FILE = "controller.st", "controller.xml", "controller.fmu"
 
 
 def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, str]:

@@ -32,7 +32,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "functions": {
         "cluster": "cluster", "fmu": "formats", "known_gap": "limitations",
         "measured_answer": "measured", "measured_page": "measured",
-        "none_reaches": "limitations", "structured_text": "formats",
+        "none_reaches": "limitations", "plcopen_xml": "formats", "structured_text": "formats",
     },
 })  # fmt: skip
 

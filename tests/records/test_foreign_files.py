@@ -75,7 +75,7 @@ TABLE: list[tuple[str, Callable[[Path], Any], Any]] = [
     (f"{MATLAB}/testcell_7.4_GLNX86.mat", columns, "holds no"),
     # responses for `tune`
     (f"{MATLAB}/testhdf5_7.4_GLNX86.mat", read_frequency_response, "name f_hz and re, im"),
-    (f"{MATLAB}/teststruct_7.4_GLNX86.mat", read_frequency_response, "teststruct: holds no numbers"),
+    (f"{MATLAB}/teststruct_7.4_GLNX86.mat", read_frequency_response, "struct: holds no numbers"),
     ("twincat_scope.csv", read_frequency_response, "twincat_scope.csv"),
 ]  # fmt: skip
 
@@ -104,6 +104,8 @@ def test_there_are_thirty() -> None:
 @pytest.mark.filterwarnings("ignore::scipy.io.wavfile.WavFileWarning")
 def test_it_is_read_as_what_it_holds(name: str, read: Callable[[Path], Any], truth: Any) -> None:
     path = place(name)
+    if "hdf5" in name:
+        pytest.importorskip("h5py")
     if isinstance(truth, str):
         with pytest.raises((PlantError, UserError)) as caught:
             read(path)
