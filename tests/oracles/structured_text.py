@@ -13,7 +13,7 @@ DECLARED = re.compile(
 )
 STATEMENTS = (
     (re.compile(r"IF (.+) THEN"), r"if \1:"),
-    (re.compile(r"FOR (\w+) := (.+) TO (.+) DO"), r"for \1 in range(\2, \3 + 1):"),
+    (re.compile(r"WHILE (.+) DO"), r"while \1:"),
     (re.compile(r"(\w+(?:\[.+\])?) := (.+);"), r"\1 = \2"),
 )
 
@@ -48,7 +48,7 @@ def _python(body: str) -> str:
     for line in map(str.strip, body.splitlines()):
         if line in ("", "END_FUNCTION_BLOCK"):
             continue
-        if line in ("END_IF;", "END_FOR;"):
+        if line in ("END_IF;", "END_WHILE;"):
             depth -= 1
             continue
         pattern, form = next((p, f) for p, f in STATEMENTS if p.fullmatch(line))

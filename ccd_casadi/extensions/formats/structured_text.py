@@ -9,9 +9,14 @@ from ccd_casadi.support.text import template
 
 
 def structured_text(
-    realisation: Realisation, *, title: str, delay: float, verified: bool, kind: str = "Controller"
-) -> str:
-    """The function block; delay in s. A controller without states keeps one that stays at rest."""
+    realisation: Realisation, *, title: str, delay: float, verified: bool, kind: str = "Controller",
+    no_limit: float = 1e30,
+) -> str:  # fmt: skip
+    """The function block; delay in s. A controller without states keeps one that stays at rest.
+
+    Its words are such that matiec compiles them: no name of a standard function (LIMIT), no single
+    letter that qualifies an action (D, L), and no FOR, which it skips where both ends are equal.
+    """
     K, limit, sizes = realisation.system, realisation.saturation, realisation.blocks or (1,)
     n, (m, p), rest = sum(sizes), K.D.shape, {}
     if not len(K.A):
@@ -20,7 +25,7 @@ def structured_text(
     starts = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
     L = realisation.back_calculation
     values = values_of(realisation, title, delay, verified, kind) | {
-        "n": n, "limit": literal(1e308 if limit is None else limit), "starts": starts,
+        "n": n, "limit": literal(no_limit if limit is None else limit), "starts": starts,
         "ends": starts + np.repeat(sizes, sizes) - 1, "A": K.A,
         "L": np.zeros((n, m)) if L is None else L, "numbers": lambda entries: literals(entries, 8),
     }  # fmt: skip
