@@ -28,13 +28,13 @@ def scope(mark: str = "\t", comma: bool = False, second: float = 0.5) -> str:
     own = signals()
     named = ["Name", *own, "Name", "Slow"]
     rows = [
-        ["Name", "a scope"], ["Starttime of export", "1"], [],
+        ["Name", "a scope"], ["File", "a.csv"], ["Starttime of export", "1"], [],
         named,
         [cell if cell == "Name" else "" for cell in named],
         ["SampleTime[ms]", *["0.5"] * 3, "SampleTime[ms]", repr(second)],
         ["Unit", "N (Force)", "N (Force)", "mm (Position)", "Unit", "(None)"], [],
     ]  # fmt: skip
-    rows[4] = ["SymbolComment" if cell == "Name" else cell for cell in rows[4]]
+    rows[5] = ["SymbolComment" if cell == "Name" else cell for cell in rows[5]]
     for k in range(COUNT):
         row = [number(1e3 * PERIOD * k), *(number(float(v[k])) for v in own.values())]
         ended = k * PERIOD * 1e3 > (COUNT - 1) * PERIOD * 1e3 * 0.5 / second + 1e-9
@@ -77,6 +77,21 @@ def test_the_scope_of_a_real_machine(tmp_path: Path) -> None:
     np.testing.assert_array_equal(columns["func_units_scaled (dV)"], 10.0 - 10.0 * count)
     np.testing.assert_array_equal(columns["func_scaled_int"], 1.0 - count)
     assert any("func_OS, func_freesample" in note for note in notes)
+
+
+def test_a_scope_without_properties_has_units_in_its_names(tmp_path: Path) -> None:
+    """As motion libraries name the channels of an axis; the last is not one of them."""
+    own = signals()
+    rows = ["Name,YT Scope,", "File,a.csv,", "Starttime of export,1", "",
+            "Name,NoiseOut[0],ServoOutN[0],ActPosUm[0],ActVelMm[0]", ""]  # fmt: skip
+    rows += [f"{0.125 * k!r},{','.join(repr(float(v[k])) for v in own.values())},0"
+             for k in range(COUNT)]  # fmt: skip
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    found = read_record(tmp_path / "log.csv")
+    assert found.period == pytest.approx(1.0 / 8000.0)
+    np.testing.assert_allclose(found.position, 1e-6 * own["Position"], rtol=1e-15)
+    np.testing.assert_allclose(found.force, own["Force"], rtol=1e-15)
+    assert "position 'ActPosUm[0]' in Um" in found.words
 
 
 def test_a_tdms_log_is_a_record(tmp_path: Path) -> None:

@@ -78,9 +78,13 @@ def parted(name: str) -> tuple[str, str]:
 
     Examples
     --------
-    >>> parted("Position [mm]"), parted("force_command"), parted("pos_um")
-    (('position', 'mm'), ('force command', ''), ('pos', 'um'))
+    >>> parted("Position [mm]"), parted("force_command"), parted("pos_um"), parted("ActPosUm[0]")
+    (('position', 'mm'), ('force command', ''), ('pos', 'um'), ('actpos', 'um'))
     """
+    name = re.sub(r"\[\d+\]$", "", name.strip())  # the number of an axis
+    camel = re.fullmatch(r"(\w*[a-z])(Um|Mm|Mrad|Urad|N)", name)
+    if camel:
+        return _plain(camel[1]), _plain(camel[2])
     plain = _plain(name)
     bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", plain)
     if bracket:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ccd_casadi.support.errors import UserError
 
-RATE, NAME, UNIT = "SampleTime[ms]", "Name", "Unit"
+RATE, NAME, FILE, UNIT = "SampleTime[ms]", "Name", "File", "Unit"
 
 
 def is_scope(text: str) -> bool:
@@ -22,7 +22,7 @@ def is_scope(text: str) -> bool:
     bool
     """
     lines = text.splitlines()[:30]
-    return bool(lines) and lines[0].startswith(NAME) and _mark(lines) is not None
+    return len(lines) > 1 and lines[0].startswith(NAME) and lines[1].startswith(FILE + _mark(lines))
 
 
 def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -46,23 +46,18 @@ def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[st
         The separator occurs inside cells, or a line is not numbers.
     """
     lines = [line.rstrip("\r") for line in text.splitlines()]
-    mark = _mark(lines[:30])
-    assert mark is not None
-    at = next(i for i, line in enumerate(lines) if line.startswith(RATE))
-    rates = lines[at].split(mark)
-    top = max(i for i in range(at) if lines[i].split(mark)[0].strip('"') == NAME)
-    names = lines[top].split(mark)
+    mark = _mark(lines)
+    top = max(i for i, line in enumerate(lines[:30]) if line.split(mark)[0].strip('"') == NAME)
+    at = next((i for i, line in enumerate(lines[:30]) if line.startswith(RATE)), top)
+    names, rates = (_trimmed(lines[i].split(mark)) for i in (top, at))
+    head = RATE if at > top else NAME  # without the channels' properties all are of one time
     units = next((line.split(mark) for line in lines[at:] if line.startswith(UNIT + mark)), [])
-    while rates and not rates[-1].strip():
-        rates.pop()
-    if [i for i, name in enumerate(names) if name == NAME] != [
-        i for i, cell in enumerate(rates) if cell == RATE
-    ] or len(names[: len(rates)]) != len(rates):
+    times = [i for i, cell in enumerate(rates) if cell == head]
+    if [i for i, name in enumerate(names) if name == NAME] != times or len(names) != len(rates):
         words = "is its separator and also within a name or a decimal; export with tabs"
         raise UserError(f"{path}: line {at + 1}: {mark!r} {words}")
-    times = [i for i, cell in enumerate(rates) if cell == RATE]
     of = {i: max(t for t in times if t < i) for i in range(len(rates)) if i not in times}
-    steps = {i: float(rates[i].replace(",", ".")) for i in of}
+    steps = {i: float(rates[i].replace(",", ".")) if at > top else 0.0 for i in of}
     most = max(set(steps.values()), key=lambda step: (list(steps.values()).count(step), -step))
     kept = [i for i in of if steps[i] == most]
     first = next(i for i in range(at, len(lines)) if not lines[i].strip(mark + " ")) + 1
@@ -87,10 +82,15 @@ def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[st
     return found, notes
 
 
-def _mark(lines: Sequence[str]) -> str | None:
-    """What follows the first name of the row of sampling times."""
-    return next((line[len(RATE)] for line in lines
-                 if line.startswith(RATE) and len(line) > len(RATE)), None)  # fmt: skip
+def _mark(lines: Sequence[str]) -> str:
+    """What follows the first word of the file."""
+    return lines[0].removeprefix(NAME)[:1] or "\t"
+
+
+def _trimmed(row: list[str]) -> list[str]:
+    while row and not row[-1].strip():
+        row.pop()
+    return row
 
 
 def _named(name: str, unit: str) -> str:
