@@ -151,7 +151,7 @@ def estimate_plant(
     records = [series] if isinstance(series, TimeSeries) else list(series)
     step = records[0].period
     for one in records:
-        _require_alive(one)
+        require_alive(one)
         if abs(one.period / step - 1.0) > options.same_rate:
             rates = f"{1.0 / step:.6g} and {1.0 / one.period:.6g} Hz"
             raise UserError(f"the records have {rates}; give records of one rate")
@@ -178,15 +178,14 @@ def estimate_plant(
     changes = np.diff(signals, axis=2)
     spectra = np.fft.rfft(changes, axis=2) / np.sqrt(count - 1)
     resolution = 1.0 / ((count - 1) * step)
-    lines = _kept(spectra.shape[2], periods, options)
+    lines = kept_lines(spectra.shape[2], periods, options)
     fit = fit_locally(spectra[:, :2], spectra[:, 2], lines, periods, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         G = fit.G[:, 0] / fit.G[:, 1]
         side = np.stack([np.ones_like(G), -G], axis=1)
         variance = np.einsum("ki,kij,kj->k", side, fit.covariance, side.conj()).real
         variance = variance / np.abs(fit.G[:, 1]) ** 2
-        freedom = np.maximum(fit.degrees, 1.0)
-        quantile = freedom * ((1.0 - options.confidence) ** (-1.0 / freedom) - 1.0)
+        quantile = quantile_of(fit.degrees, options)
         spread = options.allowance * np.sqrt(np.maximum(variance, 0.0) * quantile)
     known = np.isfinite(G) & np.isfinite(spread) & (G != 0.0)
     hz, G, spread = resolution * lines[known], G[known], spread[known]
@@ -203,8 +202,31 @@ def estimate_plant(
                          drift)  # fmt: skip
 
 
-def _require_alive(series: TimeSeries) -> None:
-    """Raise UserError where a signal is constant."""
+def quantile_of(degrees: Array, options: EstimateOptions) -> Array:
+    """Find the quantile of |e|²/σ² of an error e at the stated confidence.
+
+    Parameters
+    ----------
+    degrees : array (k,)
+        Of freedom behind σ², complex.
+    options : EstimateOptions
+
+    Returns
+    -------
+    array (k,)
+        Of Fisher's F(2, 2ν).
+    """
+    freedom = np.maximum(degrees, 1.0)
+    return np.asarray(freedom * ((1.0 - options.confidence) ** (-1.0 / freedom) - 1.0))
+
+
+def require_alive(series: TimeSeries) -> None:
+    """Raise UserError where a signal is constant.
+
+    Parameters
+    ----------
+    series : TimeSeries
+    """
     if not np.ptp(series.excitation) > 0.0:
         raise UserError("the excitation is constant, so nothing moves the plant; name another "
                         "column (--injected, --reference)")  # fmt: skip
@@ -213,9 +235,19 @@ def _require_alive(series: TimeSeries) -> None:
             raise UserError(f"the {name} is constant; name another column (--{name})")
 
 
-def _kept(count: int, periods: int, options: EstimateOptions) -> np.ndarray:
-    """Lines of the transform, those that are excited of a periodic record, thinned where they are
-    closer than `apart`."""
+def kept_lines(count: int, periods: int, options: EstimateOptions) -> np.ndarray:
+    """Find the lines of a transform that are kept.
+
+    Parameters
+    ----------
+    count, periods, options : int, int, EstimateOptions
+        Lines of the transform; whole periods of the excitation in it, 1 if it is not periodic.
+
+    Returns
+    -------
+    int array (k,)
+        Those that are excited of a periodic record, thinned where they are closer than `apart`.
+    """
     lines = np.arange(periods, count - 1, periods)
     lines = lines[lines > 1] if periods == 1 else lines
     kept, last = [], 0.0

@@ -4,19 +4,25 @@ import argparse
 import sys
 from dataclasses import replace
 from io import BytesIO, StringIO
+from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import option, positive, real, valued
 from ccd_casadi.support.terminal import inform
 
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.extensions.records.plant_estimate import EstimateOptions
+    from ccd_casadi.extensions.records.time_series import SignalNames
+
 
 @command(
     "ccd_casadi.record", "Estimate a plant's response from records of its loop, for ccd tune.",
     option("--injected", metavar="NAME", help="column of the force that is injected"),
     option("--reference", metavar="NAME", help="column of the reference, where that excites"),
-    option("--force", metavar="NAME", help="column of the plant's whole force, by the controller"),
-    option("--position", metavar="NAME", help="column of the position"),
+    option("--force", metavar="NAME[,NAME]",
+           help="column of the plant's whole force, by the controller; of several, a LOG each"),
+    option("--position", metavar="NAME[,NAME]", help="column of the position, or of several"),
     option("--time", metavar="NAME", help="column of the time"),
     option("--open-loop", action="store_true", help="the force is the excitation"),
     option("--add-injected", action="store_true",
@@ -26,8 +32,8 @@ from ccd_casadi.support.terminal import inform
     valued("--gain", "X", positive, "factor on the response, where units are not m and N", 1.0),
     option("--rotary", action="store_true", help="the position is in rad, the force in N m"),
     needs=["ccd_casadi.extensions.records.plant_estimate", "ccd_casadi.extensions.records.picture"],
-    place=RUN | {"metavar": "LOG", "nargs": "+", "help": "records (.csv, .npz, .mat, .wav) of one "
-                 "loop; channels of WAV are named 1, 2, ..."},
+    place=RUN | {"metavar": "LOG", "nargs": "+", "help": "records (.csv, .npz, .mat, .tdms, "
+                 ".wav) of one loop; channels of WAV are named 1, 2, ..."},
     without_effect=["--workers", "--seed", "--no-user-code"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
@@ -47,6 +53,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         options.rate_hz, options.open_loop, options.add_injected,
     )  # fmt: skip
     how = EstimateOptions(confidence=options.confidence)
+    if "," in (options.force or "") + (options.position or ""):
+        return _several(options, names, how)
     records = [read_record(path, names) for path in options.run]
     for path, one in zip(options.run, records, strict=True):
         inform(f"{path.name}: {one.words}", sys.stderr)
@@ -78,5 +86,42 @@ def main(options: argparse.Namespace) -> ExitCode:
     rate = 1.0 / records[0].period
     rows += [("picture", str(folder / "response.png")),
              ("next", f"ccd tune {folder / 'response.npz'} --rate-hz {rate:.6g}")]  # fmt: skip
+    inform("\n".join(f"{name:14s}{words}" for name, words in rows))
+    return ExitCode.DONE
+
+
+def _several(options: argparse.Namespace, names: "SignalNames", how: "EstimateOptions") -> ExitCode:
+    """The same of several forces and positions, without a picture."""
+    import numpy as np
+
+    from ccd_casadi.extensions.records.channels_estimate import (
+        channel_findings,
+        estimate_channels,
+        read_channels,
+    )
+    from surrogates.files import write_whole
+
+    if options.force is None or options.position is None:
+        raise UserError("--force, --position: of several channels state both, apart by commas")
+    own = [[name.strip() for name in text.split(",")] for text in (options.force, options.position)]
+    excited = (options.injected or options.reference or "").split(",")
+    if len(excited) not in (1, len(options.run)):
+        raise UserError(f"--injected: names {len(excited)} columns; state one, or one a LOG")
+    excited = excited * (len(options.run) // len(excited))
+    injected, none = not options.reference, [None] * len(options.run)
+    columns = [name or None for name in excited]
+    each = [replace(names, injected=one, reference=other) for one, other in
+            zip(*((columns, none) if injected else (none, columns)), strict=True)]  # fmt: skip
+    records = [read_channels(path, one, *own) for path, one in zip(options.run, each, strict=True)]
+    for path, record in zip(options.run, records, strict=True):
+        inform(f"{path.name}: {record[0][0].words}", sys.stderr)
+    found = estimate_channels(records, how)
+    folder, stream = run_folder(options.run[0], options.out), BytesIO()
+    np.savez(stream, f_hz=found.hz, G=options.gain * found.G, spread=options.gain * found.spread,
+             coherence=found.coherence)  # fmt: skip
+    write_whole(folder / "response.npz", stream.getvalue())
+    rate = 1.0 / records[0][0][0].period
+    ahead = f"ccd tune {folder / 'response.npz'} --rate-hz {rate:.6g}"
+    rows = [*channel_findings(found, how), ("next", ahead)]
     inform("\n".join(f"{name:14s}{words}" for name, words in rows))
     return ExitCode.DONE
