@@ -293,7 +293,8 @@ def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
     found = SimpleNamespace(
         sampled=model, worst=worst, members=(worst,), rate_hz=1e4, delay=1e-4, needed_hz=1e4,
         realisation=SimpleNamespace(system=SimpleNamespace(A=np.zeros((4, 4)))), stable=True,
-        shortfalls=(), levels=(), unverified="", judge=None, target=SimpleNamespace(excess=0.05),
+        shortfalls=(), levels=(), unverified="", judge=None, rounding=None,
+        target=SimpleNamespace(excess=0.05),
     )  # fmt: skip
     run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)))
     words = f"{'; '.join(deployed_line(run, found).clauses)};"
