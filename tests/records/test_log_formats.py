@@ -68,6 +68,15 @@ def test_decimals_that_are_the_separator_are_refused(tmp_path: Path) -> None:
         read_columns(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize("kept", [2, 5, 9, 17, 24])
+def test_a_scope_that_is_cut_off_is_refused_in_one_line(tmp_path: Path, kept: int) -> None:
+    lines = (FOREIGN / "twincat_scope.csv").read_text().splitlines()[:kept]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(UserError) as caught:
+        read_columns(tmp_path / "log.csv")
+    assert len(str(caught.value).splitlines()) == 1
+
+
 def test_the_scope_of_a_real_machine(tmp_path: Path) -> None:
     """Values as the scope has scaled them: the channel's own offset and factor are in them."""
     columns, rate, notes = read_columns(FOREIGN / "twincat_scope.csv")
@@ -94,7 +103,7 @@ def test_a_scope_without_properties_has_units_in_its_names(tmp_path: Path) -> No
     assert "position 'ActPosUm[0]' in Um" in found.words
 
 
-def test_a_tdms_log_is_a_record(tmp_path: Path) -> None:
+def test_a_tdms_log_is_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     nptdms = pytest.importorskip("nptdms")
     own, units = signals(), {"Injected": "N", "Force": "N", "Position": "um"}
 
@@ -116,8 +125,13 @@ def test_a_tdms_log_is_a_record(tmp_path: Path) -> None:
     for changed in ({"wf_increment": 1e-3}, {"wf_start_offset": PERIOD}):
         with pytest.raises(UserError, match="different sampling times"):
             read_record(written("b.tdms", **changed))
+    raw = (tmp_path / "a.tdms").read_bytes()
+    (tmp_path / "cut.tdms").write_bytes(raw[:-200])
+    with pytest.raises(UserError, match="is cut off or damaged"):
+        read_record(tmp_path / "cut.tdms")
+    assert capsys.readouterr().err == ""
     (tmp_path / "c.tdms").write_bytes(b"TDSm" + bytes(40))
-    with pytest.raises(UserError, match=r"is not a readable \.tdms file|holds no signals"):
+    with pytest.raises(UserError, match=r"is not a readable \.tdms file|cut off or damaged"):
         read_record(tmp_path / "c.tdms")
 
 

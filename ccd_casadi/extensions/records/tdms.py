@@ -1,10 +1,40 @@
 """Logs of LabVIEW (.tdms) by npTDMS: every channel of one length and one sampling time."""
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from ccd_casadi.support.errors import UserError, described, require
+
+
+class _Kept(logging.Handler):
+    """Keeps what is logged."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.words: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.words.append(record.getMessage())
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """The warnings of npTDMS, which reads on where a file is cut off, instead of its printing."""
+    kept = _Kept()
+    logs = [logging.getLogger(name) for name in (*logging.root.manager.loggerDict,)
+            if name.partition(".")[0] == "nptdms"]  # fmt: skip
+    before = [log.handlers for log in logs]
+    for log in logs:
+        log.handlers = [kept]
+    try:
+        yield kept.words
+    finally:
+        for log, own in zip(logs, before, strict=True):
+            log.handlers = own
 
 
 def tdms_columns(path: Path) -> tuple[dict[str, np.ndarray], float | None, list[str]]:
@@ -30,13 +60,15 @@ def tdms_columns(path: Path) -> tuple[dict[str, np.ndarray], float | None, list[
     """
     nptdms = require("nptdms", "tdms")
     try:
-        with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
+        with _heard() as found, path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
             every = [one for group in file.groups() for one in group.channels()]
             read = [(one, np.asarray(one[:])) for one in every]
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
         raise UserError(f"{path}: is not a readable .tdms file: {described(error)}") from None
+    if found:
+        raise UserError(f"{path}: is cut off or damaged: {found[0]}; export it again")
     kept = [(one, own) for one, own in read if own.dtype.kind in "biuf" and own.size]
     names = [one.name for one, _ in kept]
     columns, clocks = dict[str, np.ndarray](), set()

@@ -45,7 +45,16 @@ def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[st
     UserError
         The separator occurs inside cells, or a line is not numbers.
     """
-    lines = [line.rstrip("\r") for line in text.splitlines()]
+    try:
+        return _columns(path, [line.rstrip("\r") for line in text.splitlines()])
+    except UserError:
+        raise
+    except (StopIteration, ValueError, IndexError):
+        words = "is cut off or changed: it needs names, sampling times, an empty line and numbers"
+        raise UserError(f"{path}: as a TwinCAT scope it {words}; export it again") from None
+
+
+def _columns(path: Path, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
     mark = _mark(lines)
     top = max(i for i, line in enumerate(lines[:30]) if line.split(mark)[0].strip('"') == NAME)
     at = next((i for i, line in enumerate(lines[:30]) if line.startswith(RATE)), top)
@@ -64,6 +73,8 @@ def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[st
     body = [(i, lines[i].split(mark)) for i in range(first, len(lines))
             if lines[i].strip() not in ("", "EOF")]  # fmt: skip
     clock = _column(path, body, of[kept[0]], len(rates))
+    if not len(clock):
+        raise ValueError
     found = {"t (ms)": clock}
     for i in kept:
         if of[i] != of[kept[0]]:
