@@ -15,7 +15,7 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import write_page
 from ccd_casadi.reporting.decision import advice, lines_of
-from ccd_casadi.reporting.facts import cost_words, run_name
+from ccd_casadi.reporting.facts import cost_words, requirement_words, run_name
 from ccd_casadi.reporting.gain_figures import gain_panels, run_view
 from ccd_casadi.support.text import display_unit, number
 
@@ -148,10 +148,11 @@ def _requirements(first: FinishedRun, second: FinishedRun, names: tuple[str, str
         cells = []
         for of in found:
             one = of.get(name)
-            known = one is not None and one["achieved"] is not None
-            achieved = f"{one['achieved']:.5g}" if one is not None and known else "not known"
-            cells.append("–" if one is None else f"{achieved} of {one['required']:.5g}")
-            cells.append("–" if one is None else one["evidence"])
+            if one is None:
+                cells += ["–", "–"]
+                continue
+            required, achieved = requirement_words(one)
+            cells += [f"{achieved} of {required}", one["evidence"]]
         rows.append((name, *cells))
     head = ("requirement", names[0], "known by", names[1], "known by")
     return c.Table(head, tuple(rows))
