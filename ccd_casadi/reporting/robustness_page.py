@@ -90,8 +90,10 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     """
     throughout = np.allclose(found.damping.stable, found.demands.damping, rtol=1e-9)
     S_max, lost = run.problem.inner.S_max, _bandwidth_lost(run, found)
-    ends = zip(found.box.place, _own_set(run), strict=True)
-    outside = not all(low <= value <= high for value, (low, high) in ends)
+    named = _own_set(run)
+    outside = any(low < high for low, high in named) and not all(
+        low <= value <= high for value, (low, high) in zip(found.box.place, named, strict=True)
+    )
     return _words("findings", found, S_max, run.sampling, throughout, lost, outside)
 
 
@@ -200,10 +202,11 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
 
 
 def _required(factor: float, own: tuple[float, float]) -> tuple[Level, ...]:
-    """The ends of the case's [robust] set on an axis; nothing where it names none."""
+    """Both ends of the case's [robust] set on an axis; nothing where it names none."""
     if own[0] == own[1]:
         return ()
-    return tuple(Level(factor * end, "end of the [robust] set", True, GREEN) for end in own)
+    words = ("[robust] set from here", "")
+    return tuple(Level(factor * v, said, True, GREEN) for v, said in zip(own, words, strict=True))
 
 
 def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:

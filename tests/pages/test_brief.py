@@ -103,7 +103,7 @@ def test_what_changed_between_two_runs(two_mass_run: Path, tmp_path: Path, capsy
     (bandwidth,) = (line for line in lines if line.startswith("bandwidth "))
     assert bandwidth.endswith("none")
     page = (folders[1] / "changes.html").read_text()
-    assert "+w1 = 3.25" in page
+    assert "+objective.w1 = 3.25" in page
     assert f"{result['requirements'][0]['achieved']:.5g} of" in page
     assert "what changed from another run" in (folders[1] / "index.html").read_text()
     assert report.main([str(folders[0]), str(folders[1]), "--brief"]) == 2
