@@ -9,7 +9,7 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front, bandwidth_of, natural_hz
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
+from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.reporting.decision import decide
 from ccd_casadi.reporting.facts import (
@@ -55,7 +55,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     (rule,) = paragraphs("insight.rule", bandwidth_hz, natural_hz(run))
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
-    decided, answer = decide(run.result), front_answer(problem, front)
+    decided, answer = decide(run.result), front_answer(problem, front, cost)
     if decided.refuses:  # what a design trades is no question before that
         answer = f"{decided.words} {answer}"
     head = head_of(
@@ -107,9 +107,8 @@ def front_figure(
     cost = np.array([point.hardware_cost for point in front.points])
     values = v.factor * np.array([point.value for point in front.points])
     good = np.array([point.verified for point in front.points])
-    curves = [
-        c.Curve(cost, values, "", GREY, marker="."),
-        c.Curve(cost[good], values[good], "the best design for some weights", line="", marker="o"),
+    curves = [  # no line between them: where a front is hollow, no weights lead to a design
+        c.Curve(cost[good], values[good], "the best design for some weights", line="", marker="o")
     ]
     if not good.all():
         curves.append(c.Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
@@ -129,9 +128,17 @@ def front_figure(
     return c.Figure(lines, paragraph("insight.front", front), (_table(problem, front),))
 
 
-def front_answer(problem: CoDesignProblem, front: Front) -> str:
-    """What the front says of weight against what J counts, in one sentence."""
-    return paragraphs("insight.answer", problem, front)[0]
+def front_answer(problem: CoDesignProblem, front: Front, own: float | None = None) -> str:
+    """What the front says of weight against what J counts, in one sentence; with what the next
+    piece of hardware is worth at its ends and at the design whose hardware cost is `own`."""
+    good = [point for point in front.points if point.verified]
+    cost, value = (np.array([getattr(point, name) for point in good], float)
+                   for name in ("hardware_cost", "value"))  # fmt: skip
+    rates = problem.figure.factor * np.diff(value) / np.diff(cost)
+    here = None
+    if own is not None and len(rates) > 1:
+        here = rates[min(int(np.abs(cost - own).argmin()), len(rates) - 1)]
+    return paragraphs("insight.answer", problem, front, rates, here)[0]
 
 
 def _walk(run: FinishedRun, front: Front) -> c.Steps:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from oracles.chromium import axe_findings
 from oracles.kept_pictures import picture
 
 from ccd_casadi import explore
@@ -230,6 +231,7 @@ def test_it_fits_and_does_not_complain(browser, server, width, scheme):
     light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
     assert light == (scheme == "light")
     picture(page, f"explorer_{width}_{scheme}", whole=True)
+    assert axe_findings(page) == []
     assert not heard
 
 
