@@ -24,8 +24,8 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.reporting.concerns import loop_concerns
-from ccd_casadi.reporting.decision import Build, Decision, decide, lines_of, unproven
+from ccd_casadi.reporting.brief_risks import percent_words, risks, what_if
+from ccd_casadi.reporting.decision import Build, Decision, decide, lines_of
 from ccd_casadi.reporting.facts import (
     binding,
     cost_words,
@@ -144,7 +144,8 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
         lead=_lead(run), rows=list(before_and_after(run, options)),
         bars=nearest(list(bars(result)), options.requirements), machine=machine, S=Markup(panel),
         L=None if machine else Markup(panel_html(locus, 2, options.height, "L", "L of the loop")),
-        limits=_limits(problem, result)[: options.limits], ifs=list(what_if(result, options)),
+        limits=_limits(problem, result)[: options.limits],
+        ifs=list(what_if(result, options.shift, options.gain)),
         risks=risks(result)[: options.risks],
         notes=(_checks(result), f"Next: {_next(decided, result)}.", _evidence(result),
                _reproduce(run)),
@@ -219,7 +220,7 @@ def bars(result: Mapping[str, Any]) -> Iterator[Bar]:
         yield Bar(
             one["name"], *requirement_words(one, digits=4),
             float("nan") if margin is None else 1.0 - margin,
-            "not known" if margin is None else f"{_percent(margin, 1)} %",
+            "not known" if margin is None else f"{percent_words(margin, 1)} %",
             requirement_place(one), one["evidence"],
         )  # fmt: skip
 
@@ -229,97 +230,6 @@ def nearest(found: list[Bar], most: int) -> list[Bar]:
     used = [-math.inf if math.isnan(bar.used) else -bar.used for bar in found]
     kept = sorted(sorted(range(len(found)), key=lambda i: used[i])[:most])
     return [found[i] for i in kept]
-
-
-def _percent(share: float, digits: int) -> str:
-    """Without the sign of a zero."""
-    rounded = round(100.0 * share, digits)
-    return f"{rounded + 0.0:.{digits}f}"
-
-
-def what_if(result: Mapping[str, Any], options: BriefOptions) -> Iterator[tuple[str, str]]:
-    """What becomes of the loop where the machine differs from its model: (if, then)."""
-    line = result.get("verdict", {}).get("survives", {})
-    percent = f"{100.0 * options.shift:g} %"
-    for word, end, sign in (("lower", 0, -1.0), ("higher", 1, 1.0)):
-        stable, kept = line.get("stable_shift"), line.get("S_max_shift")
-        if stable is not None and kept is not None:
-            then = f"unstable: it is stable to {100.0 * stable[end]:+.3g} %"
-            if sign * stable[end] >= options.shift:
-                kept_to = _percent(abs(kept[end]), 1)
-                then = "stable, and |S| exceeds S_max"
-                then += f" from {kept_to} % on" if float(kept_to) else " at once"
-            if sign * kept[end] >= options.shift:
-                then = "stable and within S_max"
-            yield f"all resonances are {percent} {word}", then
-    margin = line.get("gain_margin")
-    if margin is not None:
-        low, high = margin
-        fails = not low <= 1.0 - options.gain <= 1.0 + options.gain <= high
-        then = "unstable" if fails else "stable"
-        most = f"; on the model it may be {number(low, 2)} to {number(high, 3)} times as large"
-        yield f"the plant's gain is off by {100.0 * options.gain:g} %", then + most
-    late, deploy = result.get("delay_margin_us"), result.get("verdict", {}).get("deployable", {})
-    rate = deploy.get("rate_hz")
-    if late is not None and rate:
-        period = 1e6 / rate
-        then = "stable" if late > period else "unstable"
-        yield (
-            "one sample more of delay",
-            f"{then}; the delay margin is {number(late / period, 3)} samples",
-        )
-
-
-def risks(
-    result: Mapping[str, Any], *, identified: float = 0.1, least_shift: float = 0.005
-) -> list[str]:
-    """What may go wrong, the most serious first; what has no check is among them.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    identified, least_shift : float
-        Relative: resonances are known that well; and below which none is known.
-
-    Returns
-    -------
-    list of str
-        Sentences.
-    """
-    found = [
-        f"{line.name} {line.state}: {line.words}" for line in lines_of(result)
-        if line.state == State.FAILED
-    ]  # fmt: skip
-    survives = result.get("verdict", {}).get("survives", {})
-    if unproven(result) is not None:
-        found.append(f"The [robust] set is {unproven(result)}.")
-    elif survives.get("set") == "unproven":
-        found.append("The bounds are kept on all plants that were drawn from the [robust] set, and "
-                     "are not proven on all of it.")  # fmt: skip
-    elif not survives.get("robust_set"):
-        found.append("The case names no [robust] set: the loop is judged on its model alone.")
-    found += [f"{words[:1].upper()}{words[1:]}." for words in loop_concerns(result)]
-    if (result.get("time_budget") or {}).get("ended"):
-        found.append("The search was ended by its time budget: a better design may exist.")
-    if "deployable" in result.get("verdict", {}):
-        unknown = result["verdict"]["deployable"]["state"] == State.UNKNOWN
-        found += ["Hold and delay of the real-time system are not judged yet."] * unknown
-    shift = survives.get("S_max_shift")
-    if shift is not None and min(abs(end) for end in shift) < identified:
-        ends = f"{_percent(shift[0], 1)} to +{_percent(shift[1], 1)} %"
-        at_once = min(abs(end) for end in shift) < least_shift
-        words = f"|S| stays within S_max for resonances {ends} off their model"
-        if at_once:
-            words = "|S| exceeds S_max as soon as a resonance is off its model to one side"
-        found.insert(0 if at_once else len(found), f"{words}: identify them that well.")
-    phase, gain = result.get("phase_margin_deg"), result.get("gain_margin")
-    if phase is not None and gain is not None:
-        margins = f"{number(phase, 3)}° of phase and a gain of {number(gain, 3)}, up or down"
-        found.append(f"The least margins are {margins}; unmodelled dynamics use them up.")
-    found.append("Friction, saturation and noise are in no figure of this page unless [move] or "
-                 "[budget] names them.")  # fmt: skip
-    return found
 
 
 def _limits(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
