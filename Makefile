@@ -9,7 +9,7 @@ export OMP_NUM_THREADS := 1
 export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test tests studies test-fast test-room test-pythons test-processors lint docs bench peers setup setup-test clean
+.PHONY: solve test tests studies test-fast test-room test-pythons test-processors lint docs pictures bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
@@ -58,6 +58,11 @@ lint: setup-test
 # The documentation site, in site/: a broken link or reference is an error.
 docs: setup-test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+# The screenshots of the documentation, where a page has changed since (a test says which): needs a
+# Chromium, and ten minutes.
+pictures: setup-test
+	$(BIN)/python docs/pictures.py
 
 # `make bench LONG="--long --compile"` adds the rows that take minutes.
 bench: setup-test

@@ -3,6 +3,7 @@
 import fcntl
 import gc
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -123,6 +124,28 @@ def solved(common_folder: Callable[[str], Any]) -> Callable[[str], Path]:
         return folder
 
     return solve
+
+
+@pytest.fixture(scope="session")
+def examined(common_folder: Callable[[str], Any], solved: Callable[[str], Path]) -> Path:
+    """The run folder of case study 1 with every page that commands write; not to be changed."""
+    from importlib import import_module
+
+    with common_folder("examined") as place:
+        folder: Path = place / "run"
+        if not folder.exists():
+            making, other = place / "making", solved("lifted")
+            shutil.copytree(other, making, ignore=shutil.ignore_patterns("*-shm", "*-wal"))
+            with painting(True):
+                for command, *words in (
+                    ("robustness", making), ("deploy", making),
+                    ("insight", making, "--points", "3", "--workers", "1"),
+                    ("report", making, "--brief"), ("report", other, making),
+                ):  # fmt: skip
+                    main = import_module(f"ccd_casadi.{command}").main
+                    main([*map(str, words), "--quiet"])
+            making.rename(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -168,17 +168,13 @@ class ChannelTable:
     roll_off: int | None = key("instead of [controller]'s", None)
     least_damping: float | None = key("instead of [controller]'s", None, check=checks.DAMPING)
     S_max: float | None = key(
-        "bound of the peak of this channel's S, tighter than the whole loop's in [inner]",
+        "bound of this channel's S, tighter than [inner]'s",
         None,
         check=checks.number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
     )
-    M_K: float | None = key(
-        "M_K of this channel's W_KS, lower than that of [weights]: its force counts more",
-        None,
-        unit="N/m",
-    )
+    M_K: float | None = key("M_K of this channel, lower than [weights]'", None, unit="N/m")
     bandwidth_ratio: float = key(
-        "least ratio of this channel's bandwidth to ω_b, which is that of the slowest channel",
+        "least ratio of this channel's bandwidth to ω_b",
         1.0,
         check=checks.number(
             1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True
@@ -201,9 +197,7 @@ class ControllerTable:
     )
     integrator: bool = key("sections: whether K has an integrator with a zero", True)
     lead: int = key("sections: number of first-order leads", 1)
-    biquads: int = key(
-        "sections: number of biquads, pairs of zeros and poles: notches, skewed notches", 2
-    )
+    biquads: int = key("sections: number of biquads: notches, skewed notches", 2)
     roll_off: int = key("sections: order of the roll-off", 2)
     weighted_level: float | None = key(
         "sections: bound of |W_KS KS| and |W_T T|; absent: no bound, which results report", None
@@ -212,9 +206,7 @@ class ControllerTable:
         "sections: least damping ratio of zeros and poles", 0.0, check=checks.DAMPING
     )
     bandwidth_of: str | None = key(
-        "sections: of several sensors on one actuator, the channel whose error counts for ω_b; |S| "
-        "is then bounded where the loop is broken at each sensor and at the actuator",
-        None,
+        "sections: of several sensors on one actuator, the channel whose error counts for ω_b", None
     )
     starts: int = key(
         "sections: least number of starts; a search goes on until its best is found twice",
@@ -252,7 +244,7 @@ class DriveTable:
     filters: int = key("filters of the current command in use", 3, check=checks.count(0))
     setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
     filter_gain: float = key(
-        "what all filters on a sensor's way may raise at any frequency, over their gain at rest",
+        "most that all filters may raise at any frequency",
         10.0,
         check=checks.number(1.0, 1e6, "give 1 to 1e6", closed=True),
     )
@@ -298,9 +290,7 @@ class OuterTable:
         "matern52",
         check=checks.choice("matern52", "rbf", "auto"),
     )
-    box_points: int = key(
-        "number of θ over the box in the global check at the end; 0: no check", 32
-    )
+    box_points: int = key("number of θ in the global check at the end; 0: none", 32)
     minutes: float = key(
         "time budget of `solve`: the best design found in it is judged", 5.0, unit="min"
     )

@@ -32,8 +32,7 @@ KEYS: dict[str, tuple[Check, str]] = {
     "fixed": (checks.ANY, "instead of bounds: its value, which is not searched"),
     "varies": (
         checks.flag,
-        "with sections: true: not chosen; the loop holds at every value, as along a stroke; "
-        "`start` is the model",
+        "sections: true: the loop holds at every value, as along a stroke; `start` is the model",
     ),
 }
 

@@ -139,8 +139,8 @@ def _default(item: Field[Any]) -> str:
     """The default of a key in words. `idle` is the value of a required key where another key makes
     it of no effect, so that it need not be given there."""
     if item.default is MISSING:
-        return "required" if item.metadata["idle"] is None else "required where it has an effect"
-    return "absent" if item.default in (None, ()) else toml(item.default)
+        return "required" if item.metadata["idle"] is None else "required*"
+    return "–" if item.default in (None, ()) else toml(item.default)
 
 
 def _row(item: Field[Any]) -> tuple[str, str, str, str]:

@@ -155,19 +155,15 @@ class InnerTable:
         check=checks.points,
     )
     method: str = key(
-        "find the best weights by a search with exact derivatives, or on a grid",
-        "search",
-        check=checks.choice("search", "sweep"),
+        "how the best weights are found", "search", check=checks.choice("search", "sweep")
     )
     shape: float | None = key(
-        "sections: |S| stays below (ω/ω_b)/√2 up to ω_b, and below this times that far above, with "
-        "room that opens from ω_b on; absent: 1.1",
+        "sections: |S| stays below (ω/ω_b)/√2 up to ω_b, this times that far above; absent: 1.1",
         None,
         check=checks.number(1.0, 10.0, "give 1 to 10", closed=True),
     )
     shape_ends: str = key(
-        "with sections: the shape holds up to S_max, or up to ω_b only with all of its room there, "
-        "which lets a narrow filter at ω_b buy bandwidth",
+        "sections: the shape holds up to S_max, or up to ω_b only",
         ShapeEnd.S_MAX.value,
         check=checks.choice(*ShapeEnd),
     )
@@ -175,8 +171,7 @@ class InnerTable:
         "bound of the peak of GS, the displacement by a force at any frequency", None, unit="m/N"
     )
     minimise: str = key(
-        "with sections: the negative bandwidth, the RMS error of [budget], or the time of "
-        "[move] until it has settled",
+        "sections: what is minimised instead of the negative bandwidth",
         "bandwidth",
         check=checks.choice("bandwidth", "rms_error", "move_time"),
     )
@@ -190,8 +185,8 @@ class SuspensionTable:
     """[suspension]: where a mixed synthesis puts rigid-body poles, and how many there must be."""
 
     frequency_hz: float | None = key(
-        "frequency of the soft suspension that free bodies have in a mixed synthesis; absent: a "
-        "tenth of omega_low_hz, at most 0.1 Hz",
+        "soft suspension of free bodies in a mixed synthesis; absent: a tenth of omega_low_hz, "
+        "at most 0.1 Hz",
         None,
     )
     damping_ratio: float = key("of these poles", 0.7)
@@ -212,7 +207,7 @@ class RobustTable:
     """
 
     resonance_shift: float = key(
-        "largest common shift of all flexible frequencies, as a share",
+        "largest common shift of flexible frequencies, as a share",
         0.0,
         check=checks.number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
@@ -223,7 +218,7 @@ class RobustTable:
         "factors of every modal damping, besides 1", (), check=checks.factors
     )
     design_at: str = key(
-        'plant of the range that a full-order controller is made for; "auto" tries all three',
+        'plant that a full-order controller is made for; "auto" tries all',
         "auto",
         check=checks.choice("auto", "low", "nominal", "high"),
     )
@@ -250,8 +245,8 @@ class PlacesTable:
     """
 
     nodes: str | tuple[tuple[float, ...], ...] = key(
-        "places of the plant's inputs, each a unit force, in their order: a CSV file with a "
-        "row of coordinates each after a header, or the rows",
+        "places of the plant's inputs, in their order: a CSV file with a header, or rows of "
+        "coordinates",
         (),
         check=checks.text_or_rows,
         unit="m",
@@ -271,8 +266,8 @@ class PlacesTable:
         "least distance of two forces, and of two sensors", 0.0, check=checks.NOT_NEGATIVE, unit="m"
     )
     axes: bool = key(
-        "true: all forces and all sensors act together, an input and an output for each "
-        "motion of a rigid body normal to the nodes",
+        "true: forces and sensors act together along the motions of a rigid body normal to the "
+        "nodes",
         False,
     )
     quiet: tuple[int, ...] = key(

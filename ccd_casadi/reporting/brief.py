@@ -24,9 +24,16 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.reporting.concerns import loop_concerns
-from ccd_casadi.reporting.decision import Build, decide, lines_of, unproven
-from ccd_casadi.reporting.facts import binding, cost_words, run_name, theta_words
+from ccd_casadi.reporting.brief_risks import percent_words, risks, what_if
+from ccd_casadi.reporting.decision import Build, Decision, decide, lines_of
+from ccd_casadi.reporting.facts import (
+    binding,
+    cost_words,
+    requirement_place,
+    requirement_words,
+    run_name,
+    theta_words,
+)
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
@@ -134,24 +141,28 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
     machine = machines(run)
     return template("drawing/assets/brief.html", typeset=typeset).render(
         css=Markup(CSS), name=run_name(run.case.path), decision=decision, colour=colour,
-        lead=_lead(result), rows=list(before_and_after(run, options)),
+        lead=_lead(run), rows=list(before_and_after(run, options)),
         bars=nearest(list(bars(result)), options.requirements), machine=machine, S=Markup(panel),
         L=None if machine else Markup(panel_html(locus, 2, options.height, "L", "L of the loop")),
-        limits=_limits(problem, result)[: options.limits], ifs=list(what_if(result, options)),
-        risks=risks(result)[: options.risks], evidence=_evidence(result),
-        footer=_footer(run),
+        limits=_limits(problem, result)[: options.limits],
+        ifs=list(what_if(result, options.shift, options.gain)),
+        risks=risks(result)[: options.risks],
+        notes=(_checks(result), f"Next: {_next(decided, result)}.", _evidence(result),
+               _reproduce(run)),
     )  # fmt: skip
 
 
-def _lead(result: Mapping[str, Any]) -> str:
+def _lead(run: FinishedRun) -> str:
     """What was chosen and what it reaches, in words that need no other page."""
+    result = run.result
     count = result.get("judge", {}).get("plants", 1)
     plants = "on its model" if count == 1 else f"on every one of {counted(count, 'plant')}"
     theta = theta_words({k: v for k, v in result.items() if k != "varies"})
     varies = theta_words({**result, "theta": {}, "fixed": {}})
     over = f", {varies}" if varies else ""
     reached = f"The loop has a bandwidth of {number(result['bandwidth_hz'], 4)} Hz {plants}{over}"
-    return f"Chosen: {theta}. {reached}; the hardware costs {cost_words(result, 4)}."
+    started = "This is the start's hardware: none better was found. " if _as_started(run) else ""
+    return f"Chosen: {theta}. {started}{reached}; the hardware costs {cost_words(result, 4)}."
 
 
 def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[BeforeAfter]:
@@ -183,6 +194,13 @@ def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[Before
             yield BeforeAfter(f"resonance {i}", before, after, _change(one, other))
 
 
+def _as_started(run: FinishedRun) -> bool:
+    """Whether no better hardware was found than that of the start."""
+    pairs = zip(run.problem.start, run.theta, strict=True)
+    listed = run.result.get("listed", {}).get("values", {})
+    return not listed and all(_change(*pair) in ("", "unchanged") for pair in pairs)
+
+
 def _resonances(problem: CoDesignProblem, theta: tuple[float, ...]) -> list[float]:
     modal = free_modal(problem, mechanics(plant_of(problem), theta, derivatives=False))
     return [float(hz) for hz in sorted(modal.natural[~modal.rigid & ~modal.driven_away] / HZ)]
@@ -198,14 +216,12 @@ def _change(before: float | None, after: float) -> str:
 def bars(result: Mapping[str, Any]) -> Iterator[Bar]:
     """Every requirement with the share of it that is used."""
     for one in result.get("requirements", ()):
-        achieved, margin, hz = (one[key] for key in ("achieved", "margin", "frequency_hz"))
-        where = ("" if hz is None else f"{number(hz, 4)} Hz", one["plant"])
+        margin = one["margin"]
         yield Bar(
-            one["name"], f"{one['required']:.4g}" if one["required"] else "at most 0",
-            "not known" if achieved is None else _small_as_zero(achieved, one["required"]),
+            one["name"], *requirement_words(one, digits=4),
             float("nan") if margin is None else 1.0 - margin,
-            "not known" if margin is None else f"{_percent(margin, 1)} %",
-            ", ".join(filter(None, where)), one["evidence"],
+            "not known" if margin is None else f"{percent_words(margin, 1)} %",
+            requirement_place(one), one["evidence"],
         )  # fmt: skip
 
 
@@ -214,102 +230,6 @@ def nearest(found: list[Bar], most: int) -> list[Bar]:
     used = [-math.inf if math.isnan(bar.used) else -bar.used for bar in found]
     kept = sorted(sorted(range(len(found)), key=lambda i: used[i])[:most])
     return [found[i] for i in kept]
-
-
-def _percent(share: float, digits: int) -> str:
-    """Without the sign of a zero."""
-    rounded = round(100.0 * share, digits)
-    return f"{rounded + 0.0:.{digits}f}"
-
-
-def _small_as_zero(achieved: float, required: float, *, least: float = 1e-6) -> str:
-    """A constraint that binds at 0 is 0 but for the solver's rounding."""
-    return "0" if required == 0.0 and abs(achieved) < least else f"{achieved:.4g}"
-
-
-def what_if(result: Mapping[str, Any], options: BriefOptions) -> Iterator[tuple[str, str]]:
-    """What becomes of the loop where the machine differs from its model: (if, then)."""
-    line = result.get("verdict", {}).get("survives", {})
-    percent = f"{100.0 * options.shift:g} %"
-    for word, end, sign in (("lower", 0, -1.0), ("higher", 1, 1.0)):
-        stable, kept = line.get("stable_shift"), line.get("S_max_shift")
-        if stable is not None and kept is not None:
-            then = f"unstable: it is stable to {100.0 * stable[end]:+.3g} %"
-            if sign * stable[end] >= options.shift:
-                kept_to = _percent(abs(kept[end]), 1)
-                then = "stable, and |S| exceeds S_max"
-                then += f" from {kept_to} % on" if float(kept_to) else " at once"
-            if sign * kept[end] >= options.shift:
-                then = "stable and within S_max"
-            yield f"all resonances are {percent} {word}", then
-    margin = line.get("gain_margin")
-    if margin is not None:
-        low, high = margin
-        fails = not low <= 1.0 - options.gain <= 1.0 + options.gain <= high
-        then = "unstable" if fails else "stable"
-        most = f"; on the model it may be {number(low, 2)} to {number(high, 3)} times as large"
-        yield f"the plant's gain is off by {100.0 * options.gain:g} %", then + most
-    late, deploy = result.get("delay_margin_us"), result.get("verdict", {}).get("deployable", {})
-    rate = deploy.get("rate_hz")
-    if late is not None and rate:
-        period = 1e6 / rate
-        then = "stable" if late > period else "unstable"
-        yield (
-            "one sample more of delay",
-            f"{then}; the delay margin is {number(late / period, 3)} samples",
-        )
-
-
-def risks(
-    result: Mapping[str, Any], *, identified: float = 0.1, least_shift: float = 0.005
-) -> list[str]:
-    """What may go wrong, the most serious first; what has no check is among them.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    identified, least_shift : float
-        Relative: resonances are known that well; and below which none is known.
-
-    Returns
-    -------
-    list of str
-        Sentences.
-    """
-    found = [
-        f"{line.name} {line.state}: {line.words}" for line in lines_of(result)
-        if line.state == State.FAILED
-    ]  # fmt: skip
-    survives = result.get("verdict", {}).get("survives", {})
-    if unproven(result) is not None:
-        found.append(f"The [robust] set is {unproven(result)}.")
-    elif survives.get("set") == "unproven":
-        found.append("The bounds are kept on all plants that were drawn from the [robust] set, and "
-                     "are not proven on all of it.")  # fmt: skip
-    elif not survives.get("robust_set"):
-        found.append("The case names no [robust] set: the loop is judged on its model alone.")
-    found += [f"{words[:1].upper()}{words[1:]}." for words in loop_concerns(result)]
-    if (result.get("time_budget") or {}).get("ended"):
-        found.append("The search was ended by its time budget: a better design may exist.")
-    if "deployable" in result.get("verdict", {}):
-        unknown = result["verdict"]["deployable"]["state"] == State.UNKNOWN
-        found += ["Hold and delay of the real-time system are not judged yet."] * unknown
-    shift = survives.get("S_max_shift")
-    if shift is not None and min(abs(end) for end in shift) < identified:
-        ends = f"{_percent(shift[0], 1)} to +{_percent(shift[1], 1)} %"
-        at_once = min(abs(end) for end in shift) < least_shift
-        words = f"|S| stays within S_max for resonances {ends} off their model"
-        if at_once:
-            words = "|S| exceeds S_max as soon as a resonance is off its model to one side"
-        found.insert(0 if at_once else len(found), f"{words}: identify them that well.")
-    phase, gain = result.get("phase_margin_deg"), result.get("gain_margin")
-    if phase is not None and gain is not None:
-        margins = f"{number(phase, 3)}° of phase and a gain of {number(gain, 3)}, up or down"
-        found.append(f"The least margins are {margins}; unmodelled dynamics use them up.")
-    found.append("Friction, saturation and noise are in no figure of this page unless [move] or "
-                 "[budget] names them.")  # fmt: skip
-    return found
 
 
 def _limits(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
@@ -328,26 +248,55 @@ def _evidence(result: Mapping[str, Any]) -> str:
     return ". ".join(filter(None, (*words, second))) + "."
 
 
-def _footer(run: FinishedRun) -> str:
+def _checks(result: Mapping[str, Any]) -> str:
+    """The states of the verdict's lines: what was not checked is named, never left out."""
+    found = []
+    for line in lines_of(result):
+        unknown = line.state == State.UNKNOWN
+        found.append(f"{line.name} {f'UNKNOWN ({line.words})' if unknown else line.state}")
+    return f"Checks: {'; '.join(found) or 'none'}."
+
+
+def _next(decided: Decision, result: Mapping[str, Any]) -> str:
+    """What to do after reading this page."""
+    deployed = "order" in result.get("verdict", {}).get("deployable", {})
+    build = (
+        [] if deployed or decided.refuses else ["ccd deploy, which writes the controller's code"]
+    )
+    return "; ".join([*decided.steps, *build]) or "put the controller on the machine"
+
+
+def _reproduce(run: FinishedRun) -> str:
+    """Which version made this, of what, and the command that makes it again."""
     result, value = run.result, FIGURES[run.result.get("minimise", "bandwidth")]
-    rate = "" if run.problem.sampling is None else f"{number(run.problem.sampling.rate_hz)} Hz, "
-    delay = "" if not rate else f"delay {with_unit(run.problem.sampling.delay, 's')}, "  # type: ignore[union-attr]
+    versions, sampling = result.get("versions", {}), run.problem.sampling
     order = result.get("controller", {}).get("order")
-    controller = "" if order is None else f"controller of order {order}, "
-    version = result.get("versions", {}).get("ccd-casadi", "")
-    J = f"J = {number(result['objective'], 5)} of cost and {value.words}"
-    run_by = f"seed {result['seed']}, ccd-casadi {version}"
-    return f"{run.case.path.name}: {J}; {controller}{rate}{delay}{run_by}"
+    words = [f"J = {number(result['objective'], 5)} of cost and {value.words}"]
+    if order is not None:
+        words.append(f"controller of order {order}")
+    if sampling is not None:
+        late = with_unit(sampling.delay, "s")
+        words.append(f"judged at {number(sampling.rate_hz)} Hz with a delay of {late}")
+    command = f"ccd solve {run.case.path.name} --seed {result['seed']}"
+    if result.get("formulation"):
+        command += f" --formulation {result['formulation']}"
+    made = f"ccd-casadi {versions.get('ccd-casadi', '')}, Python {versions.get('python', '')}"
+    again = f"To reproduce it: {command}, in this run's folder, with {made}."
+    if (result.get("time_budget") or {}).get("ended"):
+        again += " Its budget of time ended the search: a faster machine may end elsewhere."
+    return f"{', '.join(words)}. {again}"
 
 
 def machines(run: FinishedRun) -> list[tuple[str, Markup]]:
     """The machine before and after at one scale: its drawing, its masses and springs, or none."""
     problem, plant = run.problem, plant_of(run.problem)
     thetas = {"before": problem.start, "after": run.theta}
+    if _as_started(run):
+        thetas = {"the design, as at the start": run.theta}
     if plant.drawing is not None:
         block = plant.drawing(thetas)
         drawn = block.drawing if isinstance(block, c.Figure) else block
-        return [("before and after", block_html(drawn, "machine"))]
+        return [(" and ".join(thetas), block_html(drawn, "machine"))]
     systems = {name: mechanics(plant, theta, derivatives=False) for name, theta in thetas.items()}
     found = {name: lumped(system) for name, system in systems.items()}
     if any(one is None for one in found.values()):

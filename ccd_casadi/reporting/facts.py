@@ -148,14 +148,49 @@ def requirements_table(result: Mapping[str, Any]) -> Table:
 
 def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for one in result.get("requirements", ()):
-        achieved, margin, hz = (one[key] for key in ("achieved", "margin", "frequency_hz"))
-        where = ("" if hz is None else f"{number(hz, 4)} Hz", one["plant"])
+        margin = one["margin"]
         yield (
-            one["name"], f"{one['required']:.5g}",
-            "not known" if achieved is None else f"{achieved:.5g}",
+            one["name"], *requirement_words(one),
             "not known" if margin is None else f"{round(100.0 * margin, 2) + 0.0:.2f} %",
-            ", ".join(filter(None, where)), one["evidence"],
+            requirement_place(one), one["evidence"],
         )  # fmt: skip
+
+
+def requirement_words(
+    one: Mapping[str, Any], *, digits: int = 5, least: float = 1e-6
+) -> tuple[str, str]:
+    """What is required and what is achieved, in the unit that an engineer would read it in.
+
+    Parameters
+    ----------
+    one : mapping
+        An entry of `requirements` in result.json.
+    digits : int
+        Significant ones.
+    least : float
+        A constraint on θ that misses 0 by less, the solver's rounding, is 0.
+
+    Returns
+    -------
+    required, achieved : str
+    """
+    required, achieved = one["required"], one["achieved"]
+    units = {"compliance_max": spoken("m/N"), "bandwidth_least_hz": "Hz"}
+    unit, factor = display_unit(units.get(one["name"], ""), required)
+
+    def shown(value: float) -> str:
+        small = required == 0.0 and abs(value) < least
+        return "0" if small else f"{factor * value:.{digits}g} {unit}".strip()
+
+    limit = shown(required) if required else "at most 0"
+    return limit, "not known" if achieved is None else shown(achieved)
+
+
+def requirement_place(one: Mapping[str, Any]) -> str:
+    """At which frequency and on which plant a requirement is nearest to its limit; may be empty."""
+    hz, plant = one["frequency_hz"], one["plant"]
+    plant = plant.replace("resonance_shift", "resonances")
+    return ", ".join(filter(None, ("" if hz is None else f"{number(hz, 4)} Hz", plant)))
 
 
 def facts(table: str, *known: Any) -> list[Fact]:
@@ -323,7 +358,7 @@ def _sentence(
         return f"{words}. {loosened}: {in_J}."
     cost = step * held.get(name, 0.0)
     value = (-falls - problem.w1 * cost) / problem.w2
-    v, changed = problem.figure, f"f by {number(cost, 3)} {problem.cost_unit}".rstrip()
+    v, changed = problem.figure, f"the cost by {number(cost, 3)} {problem.cost_unit}".rstrip()
     moves = f"{v.symbol} changes by {v.shown(value, 3)}, {changed} ({in_J})"
     return f"{words}. {loosened}: {moves}."
 

@@ -150,8 +150,8 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
         if alone:
             top = 3.5 * max(b.S_max, float(high))  # room for the words at its peak
             found["y_range"] = (0.5 * float(first.sizes[0, 0].min()), top)
-            shape = above(first.hz, first.bounds[0], top) if b.asked else ()
-            found["forbidden"] = (*forbidden(b.S_max, b.S_low, b.low_hz, *ends, top), *shape)
+            shape = (first.hz, first.bounds[0]) if b.asked else None
+            found["forbidden"] = forbidden(b.S_max, b.S_low, b.low_hz, *ends, top, shape)
         return sensitivity_panel(curves, ends, b.S_max, at, label, **{**found, **more})
     if alone and first.bounded.asked:
         found["forbidden"] = above(first.hz, first.bounds[i], found["y_range"][1])
@@ -195,10 +195,21 @@ def compliance_panel(view: LoopView) -> Panel:
 
 
 def forbidden(
-    S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float
-) -> tuple[Area, ...]:
-    """Where |S| may not be, over Hz: above S_max, and above S_low up to `low_hz`."""
-    return _box(low, high, S_max, top), _box(low, low_hz, S_low, min(S_max, top))
+    S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float,
+    shape: tuple[Array, Array] | None = None,
+) -> tuple[Area, ...]:  # fmt: skip
+    """Where |S| may not be, over Hz: above S_max, above S_low up to `low_hz`, and above a shape
+    (Hz, its gain, NaN where it asks nothing): one ground, whichever of them is the lowest."""
+    hz = np.concatenate([[low, low_hz, low_hz, high], np.empty(0) if shape is None else shape[0]])
+    past = np.zeros(len(hz))
+    past[2] = 1.0  # the second of the two at `low_hz` is beyond it
+    order = np.lexsort((past, hz))
+    hz, past = hz[order], past[order]
+    limit = np.where((hz < low_hz) | ((hz == low_hz) & (past == 0.0)), min(S_low, S_max), S_max)
+    if shape is not None:
+        own = np.interp(np.log(hz), np.log(shape[0]), shape[1])
+        limit = np.fmin(limit, own)
+    return above(hz, limit, top)
 
 
 def above(hz: Array, bound: Array, top: float) -> tuple[Area, ...]:
@@ -208,10 +219,6 @@ def above(hz: Array, bound: Array, top: float) -> tuple[Area, ...]:
         return ()
     x, y = hz[asked], bound[asked]
     return (Area(np.append(x, [x[-1], x[0]]), np.append(y, [top, top])),)
-
-
-def _box(left: float, right: float, bottom: float, top: float) -> Area:
-    return Area(np.array([left, right, right, left]), np.array([bottom, bottom, top, top]))
 
 
 def _high_peaks(view: LoopView, *, least: float = 1.05) -> list[tuple[float, float]]:

@@ -9,8 +9,9 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front, bandwidth_of, natural_hz
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
+from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.reporting.decision import decide
 from ccd_casadi.reporting.facts import (
     cost_axis,
     cost_words,
@@ -54,6 +55,9 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     (rule,) = paragraphs("insight.rule", bandwidth_hz, natural_hz(run))
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
+    decided, answer = decide(run.result), front_answer(problem, front, cost)
+    if decided.refuses:  # what a design trades is no question before that
+        answer = f"{decided.words} {answer}"
     head = head_of(
         f"Insight: {run_name(run.folder)}",
         whole,
@@ -62,7 +66,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         f"around the design of {run.folder.name}/result.json",
         f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
         f"of {cost_words(run.result)}. {rule}",
-        run.result, front_answer(problem, front),
+        run.result, answer,
     )  # fmt: skip
     v = problem.figure
     own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
@@ -88,7 +92,7 @@ def _limits(run: FinishedRun, rule: str) -> tuple[c.Block, ...]:
     """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
     if run.result.get("gamma") is None:
         held = c.Bullets(tuple(binding_words(run.problem, run.result)))
-        return held, *map(c.Words, (*paragraphs("insight.structured"), rule))
+        return held, c.Words(rule)
     return limit_blocks(run_view(run), rule)
 
 
@@ -103,9 +107,8 @@ def front_figure(
     cost = np.array([point.hardware_cost for point in front.points])
     values = v.factor * np.array([point.value for point in front.points])
     good = np.array([point.verified for point in front.points])
-    curves = [
-        c.Curve(cost, values, "", GREY, marker="."),
-        c.Curve(cost[good], values[good], "the best design for some weights", line="", marker="o"),
+    curves = [  # no line between them: where a front is hollow, no weights lead to a design
+        c.Curve(cost[good], values[good], "the best design for some weights", line="", marker="o")
     ]
     if not good.all():
         curves.append(c.Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
@@ -125,9 +128,17 @@ def front_figure(
     return c.Figure(lines, paragraph("insight.front", front), (_table(problem, front),))
 
 
-def front_answer(problem: CoDesignProblem, front: Front) -> str:
-    """What the front says of weight against what J counts, in one sentence."""
-    return paragraphs("insight.answer", problem, front)[0]
+def front_answer(problem: CoDesignProblem, front: Front, own: float | None = None) -> str:
+    """What the front says of weight against what J counts, in one sentence; with what the next
+    piece of hardware is worth at its ends and at the design whose hardware cost is `own`."""
+    good = [point for point in front.points if point.verified]
+    cost, value = (np.array([getattr(point, name) for point in good], float)
+                   for name in ("hardware_cost", "value"))  # fmt: skip
+    rates = problem.figure.factor * np.diff(value) / np.diff(cost)
+    here = None
+    if own is not None and len(rates) > 1:
+        here = rates[min(int(np.abs(cost - own).argmin()), len(rates) - 1)]
+    return paragraphs("insight.answer", problem, front, rates, here)[0]
 
 
 def _walk(run: FinishedRun, front: Front) -> c.Steps:
@@ -167,7 +178,13 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
         for point in front.points
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
-    head = ("f", f"{v.symbol} ({spoken(v.unit)})", *heads, "what binds", "status")
+    head = (
+        f"f ({problem.cost_unit})" if problem.cost_unit else "f",
+        f"{v.symbol} ({spoken(v.unit)})",
+        *heads,
+        "what binds",
+        "status",
+    )
     return c.Table(head, rows)
 
 
@@ -217,5 +234,8 @@ def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float
         return name.replace("omega", "ω"), value / HZ, 1.0 / HZ, "Hz"
     if variable in problem.names:
         unit, factor = display_unit(problem.units[problem.names.index(variable)], value)
+        return name, factor * value, factor, unit
+    if name == "compliance_max":
+        unit, factor = display_unit(spoken("m/N"), value)
         return name, factor * value, factor, unit
     return name, value, 1.0, ""

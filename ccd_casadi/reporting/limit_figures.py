@@ -44,12 +44,14 @@ def shares(loop: LoopView, hz: float) -> np.ndarray:
 
 def table_limits(loop: LoopView) -> Table:
     """Shares of γ where it matters: below, at and above the bandwidth, and at the peaks of S."""
+    most = max((gain for _, gain in loop.peaks), default=0.0)
     places = [
         ("half the bandwidth", 0.5 * loop.bandwidth_hz),
         ("bandwidth ω_b", loop.bandwidth_hz),
         ("twice the bandwidth", 2.0 * loop.bandwidth_hz),
-        *(("peak of S", hz) for hz, gain in loop.peaks if gain > 1.05),
-    ]
+        *(("peak of S" if gain == most else "local peak of S", hz)
+          for hz, gain in loop.peaks if gain > 1.05),
+    ]  # fmt: skip
     rows = []
     for name, hz in sorted(places, key=lambda place: place[1]):
         found = shares(loop, hz)

@@ -20,7 +20,8 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
+from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
@@ -89,7 +90,18 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     """
     throughout = np.allclose(found.damping.stable, found.demands.damping, rtol=1e-9)
     S_max, lost = run.problem.inner.S_max, _bandwidth_lost(run, found)
-    return _words("findings", found, S_max, run.sampling, throughout, lost)
+    named = _own_set(run)
+    outside = any(low < high for low, high in named) and not all(
+        low <= value <= high for value, (low, high) in zip(found.box.place, named, strict=True)
+    )
+    return _words("findings", found, S_max, run.sampling, throughout, lost, outside)
+
+
+def _own_set(run: FinishedRun) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The resonance shifts and damping factors that the design was required to survive."""
+    kind = kind_of(run.problem)
+    factors = (1.0, *kind.other_factors()[0])
+    return kind.common_shifts(), (min(factors), max(factors))
 
 
 def _words(part: str, *known: Any) -> list[str]:
@@ -156,10 +168,10 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
     """Peak and bandwidth over the shift, and over the damping; one mode at a time."""
     S_max = run.problem.inner.S_max
     panels = []
-    for line, label, factor in (
-        (found.shift, "resonance shift (%)", 100.0),
-        (found.damping, "damping × (–)", 1.0),
-    ):
+    for line, label, factor, own in zip(
+        (found.shift, found.damping), ("resonance shift (%)", "damping × (–)"), (100.0, 1.0),
+        _own_set(run), strict=True,
+    ):  # fmt: skip
         judged = line.judged
         x = np.array([item.place[0] for item in judged])
         peak = np.array([item.peak if item.stable else np.nan for item in judged])
@@ -172,10 +184,11 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
         span = (1.0, max(top, 1.1 * S_max))
         lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
         faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
+        required = _required(factor, own)
         panels.append((
-            Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=limit, x_range=ends,
-                  y_range=span),
-            Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
+            Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=(*limit, *required),
+                  x_range=ends, y_range=span),
+            Panel(label, "ω_b (Hz)", (faster,), levels=required, x_range=ends),
         ))  # fmt: skip
     lines = Lines(tuple(panels), "Peak of S and bandwidth off the model")
     drawn = Figure(lines, paragraph("robustness.perturbed", SHOWN_PEAK))
@@ -186,6 +199,14 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
     head = ("mode Hz", "shift %", "stable", "ω_b Hz", "‖S‖∞")
     modes = (Heading("One mode at a time"), Table(head, rows)) if rows else ()
     return Chapter("Plants off the model", (drawn, *modes))
+
+
+def _required(factor: float, own: tuple[float, float]) -> tuple[Level, ...]:
+    """Both ends of the case's [robust] set on an axis; nothing where it names none."""
+    if own[0] == own[1]:
+        return ()
+    words = ("[robust] set from here", "")
+    return tuple(Level(factor * v, said, True, GREEN) for v, said in zip(own, words, strict=True))
 
 
 def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:

@@ -15,9 +15,9 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import write_page
 from ccd_casadi.reporting.decision import advice, lines_of
-from ccd_casadi.reporting.facts import cost_words, run_name
+from ccd_casadi.reporting.facts import cost_words, requirement_words, run_name
 from ccd_casadi.reporting.gain_figures import gain_panels, run_view
-from ccd_casadi.support.text import display_unit, number
+from ccd_casadi.support.text import display_unit, number, spoken
 
 NAME = "changes.html"
 FIGURES = (  # key of result.json, its name, its unit
@@ -26,7 +26,7 @@ FIGURES = (  # key of result.json, its name, its unit
     ("sensitivity_peak", "peak of |S|", ""),
     ("phase_margin_deg", "phase margin", "deg"),
     ("gain_margin", "gain margin", ""),
-    ("delay_margin_us", "delay margin", "us"),
+    ("delay_margin_us", "delay margin", "µs"),
     ("step_overshoot", "overshoot of a step", ""),
     ("settling_ms", "settling of a step", "ms"),
     ("compliance_max", "compliance", "m/N"),
@@ -66,13 +66,13 @@ def changes_page(first: FinishedRun, second: FinishedRun) -> c.Page:
     views = [replace(run_view(run), label=name) for run, name in zip(runs, names, strict=True)]
     head = ("", *names, "change")
     S = c.Lines(((gain_panels(views, bounds=False)[0],),), "S of both runs")
-    decisions = "; ".join(
+    decisions = " ".join(
         f"{name}: {advice(run.result)}" for run, name in zip(runs, names, strict=True)
     )
     chapters = [
+        c.Chapter("Requirements", (_requirements(first, second, names),)),
         c.Chapter("Figures", (c.Table(head, tuple(figure_rows(first, second))),)),
         c.Chapter("Sensitivity", (c.Figure(S, "The largest |S| on the plants of each run."),)),
-        c.Chapter("Requirements", (_requirements(first, second, names),)),
         c.Chapter("Verdict", (_verdicts(first, second, names),)),
         c.Chapter("Case file", (_case(first, second, names),)),
     ]
@@ -112,8 +112,10 @@ def figure_rows(first: FinishedRun, second: FinishedRun) -> Iterator[Row]:
     change = _change(a["hardware_cost"], b["hardware_cost"])
     yield ("hardware cost", cost_words(a), cost_words(b), change)
     for key, name, unit in FIGURES:
-        if a.get(key) is not None or b.get(key) is not None:
-            yield _row(name, a.get(key), b.get(key), unit)
+        known = [one[key] for one in (a, b) if one.get(key) is not None]
+        if known:
+            shown, factor = display_unit(spoken(unit), max(map(abs, known)))
+            yield _row(name, a.get(key), b.get(key), shown, factor)
     orders = [one.get("controller", {}).get("order") for one in (a, b)]
     if any(order is not None for order in orders):
         yield _row("order of the controller", *orders)
@@ -148,10 +150,11 @@ def _requirements(first: FinishedRun, second: FinishedRun, names: tuple[str, str
         cells = []
         for of in found:
             one = of.get(name)
-            known = one is not None and one["achieved"] is not None
-            achieved = f"{one['achieved']:.5g}" if one is not None and known else "not known"
-            cells.append("–" if one is None else f"{achieved} of {one['required']:.5g}")
-            cells.append("–" if one is None else one["evidence"])
+            if one is None:
+                cells += ["–", "–"]
+                continue
+            required, achieved = requirement_words(one)
+            cells += [f"{achieved} of {required}", one["evidence"]]
         rows.append((name, *cells))
     head = ("requirement", names[0], "known by", names[1], "known by")
     return c.Table(head, tuple(rows))
@@ -171,12 +174,20 @@ def _verdicts(first: FinishedRun, second: FinishedRun, names: tuple[str, str]) -
 
 def _case(first: FinishedRun, second: FinishedRun, names: tuple[str, str]) -> c.Words | c.Source:
     """Which lines of the resolved cases differ, defaults included."""
-    before, after = (
-        case_to_toml(run.case).replace(f"{run.folder.resolve()}/", "").splitlines()
-        for run in (first, second)
-    )
+    before, after = (_with_tables(run) for run in (first, second))
     differ = unified_diff(before, after, names[0], names[1], n=0, lineterm="")
     lines = [line for line in differ if not line.startswith("@@")]
     if not lines:
         return c.Words("The case files are alike.")
     return c.Source("\n".join(lines))
+
+
+def _with_tables(run: FinishedRun) -> list[str]:
+    """The lines of a run's case, each key behind the name of its table."""
+    table, found = "", []
+    for line in case_to_toml(run.case).replace(f"{run.folder.resolve()}/", "").splitlines():
+        if line.startswith("["):
+            table = line.strip("[]")
+        elif line:
+            found.append(f"{table}.{line}")
+    return found

@@ -54,13 +54,16 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         stages = {LABELS[name]: tuple(theta.values()) for name, theta in thetas.items() if theta}
         chapters += stage_chapters(problem, stages)
     chapters += [
-        c.Chapter(f"Verdict: {LABELS[method.name]}", (c.Verdict(lines_of(method.figures)),))
+        c.Chapter(
+            f"Verdict: {LABELS[method.name]}", (c.Verdict(lines_of(method.figures)),), folded=True
+        )
         for method in comparison.methods
         if lines_of(method.figures)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     with_seed = c.Words(f"{versions}; seed {answer['seed']}.")
-    chapters.append(c.Chapter("The case", (with_seed, c.Source(case_to_toml(comparison.case)))))
+    source = c.Source(case_to_toml(comparison.case))
+    chapters.append(c.Chapter("The case", (with_seed, source), folded=True))
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
     warned = any(worst_state(figures) is not State.PASSED for figures in ours)
@@ -153,7 +156,7 @@ def _loops(comparison: Comparison, best: str) -> c.Figure:
             comparison.problem, tuple(method.figures["theta"].values()), method.controller,
             bandwidth_hz=method.figures["bandwidth_hz"], label=LABELS[method.name],
         )
-        for method in (comparison.method("sequential"), comparison.method(best))
+        for method in (comparison.method(best), comparison.method("sequential"))
         if method.controller is not None
     ]  # fmt: skip
     words = "; ".join(

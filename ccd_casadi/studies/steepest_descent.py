@@ -232,7 +232,7 @@ def _sweep(
 class Stop(StrEnum):
     """Why a descent ended."""
 
-    SMALL_STEP = "no step down to the smallest improves J"
+    SMALL_STEP = "no step improves J any more"
     STATIONARY = "the projected gradient vanishes"
     ITERATIONS = "it reached its limit of iterations"
     INFEASIBLE = "no design meets the bounds at the start"

@@ -103,8 +103,8 @@ def of_newtons(unit: str) -> str:
 def display_unit(unit: str, largest: float) -> tuple[str, float]:
     """Choose the unit to show values in.
 
-    Lengths, times, forces and stiffnesses get the SI prefix with which the largest is 1 or more;
-    another unit stays.
+    Lengths, times, forces, stiffnesses and compliances get the SI prefix with which the largest is
+    1 or more; another unit stays.
 
     Parameters
     ----------
@@ -123,13 +123,13 @@ def display_unit(unit: str, largest: float) -> tuple[str, float]:
     --------
     >>> display_unit("m", 4e-3), display_unit("s", 2e-5), display_unit("kg", 4e-3)
     (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
-    >>> display_unit("N/m", 3.6e7)
-    ('MN/m', 1e-06)
+    >>> display_unit("N/m", 3.6e7), display_unit("m/N", 3e-6)
+    (('MN/m', 1e-06), ('µm/N', 1000000.0))
     """
     if unit in ("N", "N/m", "N m", "N m/rad") and abs(largest) >= 1e4:
         prefix, factor = next(one for one in LARGE if abs(largest) * one[1] >= 1.0)
         return prefix + unit, factor
-    if unit not in ("m", "s", "rad") or largest == 0.0:
+    if unit not in ("m", "s", "rad", "m/N", "rad/N m") or largest == 0.0:
         return unit, 1.0
     for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
         if abs(largest) * factor >= 0.9995:  # which rounds to 1

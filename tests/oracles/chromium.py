@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,3 +22,15 @@ def chromium() -> Iterator[Any]:
         made = playwright.chromium.launch(executable_path=place, args=["--no-sandbox"])
         yield made
         made.close()
+
+
+def axe_findings(page: Any) -> list[str]:
+    """What axe-core finds on a page that is serious or critical: rule, count and first place."""
+    held = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
+    page.evaluate((Path(held.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run()")["violations"]
+    return [
+        f"{one['id']} at {len(one['nodes'])} places: {one['nodes'][0]['html'][:120]}"
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from oracles.chromium import axe_findings
 from oracles.kept_pictures import picture
 
 from ccd_casadi import explore
@@ -145,6 +146,55 @@ def test_pins_outlive_a_reload_and_a_change_to_dark(browser, server):
     assert not heard
 
 
+# A point of the loop's figure -> px of the window.
+PLACE = """([x, y]) => {
+  const of = view => view.model.name === "L" ? view
+    : (view.child_views ?? []).map(of).find(found => found != null)
+  const view = Object.values(Bokeh.index).map(of).find(found => found != null)
+  const {left, top} = view.canvas_view.el.getBoundingClientRect()
+  return [left + view.frame.x_scale.compute(x), top + view.frame.y_scale.compute(y)]
+}"""
+
+
+@pytest.mark.slow
+def test_a_notch_is_dragged_and_a_pin_is_on_the_map_without_scrolling(browser, server):
+    page, heard = opened(browser, server[1], 1400, "dark")
+    data = "Bokeh.documents[0].get_model_by_name('{}').data"
+    page.wait_for_function(f"{data.format('notch')}.x.length == 1")
+    start = page.evaluate(f"(d => [d.x[0], d.y[0]])({data.format('notch')})")
+    x, y = page.evaluate(PLACE, start)
+    said = page.locator("#say_notch")
+    assert said.inner_text().startswith("none")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    heard_while = set()
+    for step in range(1, 7):
+        page.mouse.move(x - 4 * step, y + 4 * step)
+        page.wait_for_timeout(400)
+        heard_while.add(said.inner_text())
+    page.mouse.up()
+    assert len(heard_while) > 2  # margins follow while it is dragged
+    assert "phase margin" in said.inner_text() or "UNSTABLE" in said.inner_text()
+    hz, gain = page.evaluate(f"(d => [d.x[0], d.y[0]])({data.format('notch')})")
+    assert hz < start[0]
+    assert page.evaluate(PLACE, [hz, gain]) == pytest.approx([x - 24, y + 24], abs=6)
+    page.get_by_role("button", name="Pin this design").click()
+    page.wait_for_function(f"{data.format('pinned')}.name.length == 1")
+    assert page.evaluate(f"{data.format('pinned')}.name[0]") == "pin 1"
+    land = page.get_by_role("img", name="Landscape").bounding_box()
+    assert land["y"] + land["height"] <= 900  # seen without scrolling
+    white = page.evaluate(r"""() => {
+      const all = root => [...root.querySelectorAll("*")].flatMap(one =>
+        [one, ...(one.shadowRoot ? all(one.shadowRoot) : [])])
+      return all(document).filter(one => one.matches("button"))
+        .map(one => getComputedStyle(one).backgroundColor)
+        .filter(c => c.match(/\d+/g).slice(0, 3).every(v => v > 150)).length
+    }""")
+    assert white == 0
+    picture(page, "explorer_notch_dark", whole=True)
+    assert not heard
+
+
 @pytest.mark.slow
 def test_a_solve_from_here_tells_how_far_it_is_and_ends_with_its_report(browser, server, tmp_path):
     page, heard = opened(browser, server[1])
@@ -181,6 +231,7 @@ def test_it_fits_and_does_not_complain(browser, server, width, scheme):
     light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
     assert light == (scheme == "light")
     picture(page, f"explorer_{width}_{scheme}", whole=True)
+    assert axe_findings(page) == []
     assert not heard
 
 

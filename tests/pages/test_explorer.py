@@ -11,7 +11,6 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
-from ccd_casadi.extensions.explorer.controls import landscape_of, steepest_axes
 from ccd_casadi.extensions.explorer.curves import (
     FIGURES,
     as_sampled,
@@ -26,6 +25,8 @@ from ccd_casadi.extensions.explorer.curves import (
 from ccd_casadi.extensions.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.extensions.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
+from ccd_casadi.extensions.explorer.landscape_map import landscape_of, steepest_axes
+from ccd_casadi.extensions.explorer.notch import Notch, notched
 from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop
@@ -371,3 +372,32 @@ def test_a_slow_plant_is_drawn_by_a_model_whose_error_was_measured(session):
     assert known.at(away[1]).exact
     known.renew()
     assert frequency_error(known.at(away[2]).system, own(away[2])) < off[2]
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.4])
+def test_a_notch_is_judged_as_its_response_has_it(searched_look, depth):
+    """L, S and stability against the plain product of responses, by other arithmetic."""
+    view = curves_of(searched_look).view
+    notch = Notch(1.3 * view.bandwidth_hz, depth, 0.3)
+    found = notched(view, notch)
+    s, w = 2j * np.pi * found.hz, HZ * notch.hz
+    own = (s**2 + 2 * 0.3 * depth * w * s + w**2) / (s**2 + 2 * 0.3 * w * s + w**2)
+    at = np.isin(found.hz, view.hz)  # lines of the page itself
+    # measured 8e-9: what two state spaces of one product differ by
+    np.testing.assert_allclose(found.open[at, 0, 0], view.open[0, :, 0, 0] * own[at], rtol=1e-7)
+    np.testing.assert_allclose(found.gain, 1.0 / np.abs(1.0 + found.open[:, 0, 0]), rtol=1e-7)
+    assert np.abs(own).min() == pytest.approx(depth, rel=1e-3)
+    # of the margins: on the unit circle at the crossover's distance of angle
+    crossing = np.interp(found.margins.places[2], HZ * found.hz, np.abs(found.open[:, 0, 0]))
+    assert crossing == pytest.approx(1.0, rel=0.02)
+    assert found.bandwidth_hz < view.bandwidth_hz  # it takes phase and gain below itself
+
+
+def test_a_notch_that_is_none_changes_nothing_and_a_hurtful_one_is_called_unstable(searched_look):
+    view = curves_of(searched_look).view
+    same = notched(view, Notch(view.bandwidth_hz, 1.0, 0.3)).margins
+    assert same.phase_deg == pytest.approx(view.margins.phase_deg, rel=1e-3)
+    slow = notched(view, Notch(0.3 * view.bandwidth_hz, 0.01, 2.0))
+    assert slow.stable == (slow.margins.phase_deg > 0.0)
+    wide = replace(view.loop, controller=Notch(0.3, 50.0, 2.0).behind(view.loop.controller))
+    assert wide.stable == bool((wide.poles.real < 0.0).all())

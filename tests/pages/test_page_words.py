@@ -259,8 +259,12 @@ def test_insight_and_compare_begin_with_their_answer() -> None:
     assert front_answer(problem, one).startswith("There is nothing to trade")
     two = SimpleNamespace(points=(point(100.0, 50.0), point(110.0, 70.0)))
     assert front_answer(problem, two) == (
-        "Bandwidth costs hardware: from 100 kg with 50 Hz to 110 kg with 70 Hz, on average 2 Hz "
-        "for every kg."
+        "Bandwidth costs hardware: from 100 kg with 50 Hz to 110 kg with 70 Hz, 2 Hz for every kg "
+        "between them."
+    )
+    three = SimpleNamespace(points=(*two.points, point(120.0, 71.0)))
+    assert front_answer(problem, three, 109.0).endswith(
+        "at 2 Hz for every kg where it is lightest, 0.1 where it is heaviest, 0.1 at this design."
     )
     best = {
         "syntheses_to_optimum": 5,

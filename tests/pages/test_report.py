@@ -249,7 +249,8 @@ def test_what_binds_is_said_in_words(run: Any) -> None:
     number_ = r"([-+.\de⁻·−]+)"
     for words in ("m1 is at its lower bound, 55 kg. Lowering this bound by 0.15 kg",
                   r"Raising S_max by 1 %"):  # fmt: skip
-        told = rf"{words}: ω_b changes by {number_} Hz, f by {number_} kg \(J falls by {number_}\)"
+        moves = rf"ω_b changes by {number_} Hz, the cost by {number_} kg"
+        told = rf"{words}: {moves} \(J falls by {number_}\)"
         said = re.search(told, text)
         assert said is not None
         hz, kg, J = map(float, said.groups())

@@ -16,6 +16,7 @@ from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
 from ccd_casadi.extensions.explorer.designs import Look, Standing
+from ccd_casadi.extensions.explorer.notch import Notched
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -194,9 +195,9 @@ def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
 # Name of a figure -> its heading, and whether its axes are logarithmic.
 FIGURES: dict[str, tuple[str, bool, bool]] = {
     "S": ("Sensitivity S", True, True),
-    "nyquist": ("Nyquist plot of L = GK", False, False),
     "L": ("Loop L = GK", True, True),
     "phase": ("Phase of L", True, False),
+    "nyquist": ("Nyquist plot of L = GK", False, False),
     "KS": ("Control sensitivity KS", True, True),
     "T": ("Complementary sensitivity T", True, True),
     "K": ("Controller K", True, True),
@@ -224,9 +225,11 @@ class Drawn:
     panels: Mapping[str, Panel]
 
 
-def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
-    """The panels of a design (no curves: it has no controller), with the loop as sampled if it was
-    asked."""
+def drawn(
+    look: Look, c: Curves | None, sampled: AsSampled | None, notched: Notched | None = None
+) -> Drawn:
+    """The panels of a design (no curves: it has no controller), with the loop as sampled and the
+    one with a notch where they are wanted."""
     if c is None:
         return Drawn(look, {})
     certified, view = look.standing is not Standing.REFUSED, c.view
@@ -249,7 +252,7 @@ def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
         "move": _over_time(c.move.time, 1e6 * c.move.error, "error (µm)",
                            Level(1e3 * c.move.duration, "end of the move", True)),
     }  # fmt: skip
-    return Drawn(look, panels)
+    return Drawn(look, panels if notched is None else notched.on(panels))
 
 
 def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:

@@ -16,16 +16,7 @@ from bokeh.models.widgets.markups import Div
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.paint import escape
 from ccd_casadi.extensions.explorer import ASSETS
-from ccd_casadi.extensions.explorer.controls import (
-    Controls,
-    MapFigure,
-    PlacesFigure,
-    button,
-    landscape_of,
-    moves,
-    run_surrogate,
-    steepest_axes,
-)
+from ccd_casadi.extensions.explorer.controls import Controls, PlacesFigure, button, moves
 from ccd_casadi.extensions.explorer.curves import (
     EMPTY,
     FIGURES,
@@ -43,6 +34,13 @@ from ccd_casadi.extensions.explorer.curves import (
 from ccd_casadi.extensions.explorer.designs import Designed, How, Look, anchored, designed
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
+from ccd_casadi.extensions.explorer.landscape_map import (
+    MapFigure,
+    landscape_of,
+    run_surrogate,
+    steepest_axes,
+)
+from ccd_casadi.extensions.explorer.notch_figure import NotchFigure
 from ccd_casadi.extensions.explorer.painter import (
     ON_DARK,
     Message,
@@ -62,6 +60,7 @@ TOGETHER = 4  # ms without a move of a slider, then the moves before are answere
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
 LINES = 40  # of a solve's output
 BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
+NO_NOTCH = "none: drag the diamond down from the curve of |L|, or move its gain below 1"
 SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
 
 
@@ -85,13 +84,16 @@ class ExplorerPage:
         self.controls = Controls(session.case, session.start, self.moved, dark)
         if kept.knobs is not None:
             self.controls.put(kept.knobs)
-        self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
+        unit = session.case.objective.cost_unit
+        self.pins = Pins(parameters, self.figures, self.map, kept, dark, unit)
+        loop = next(made for made in self.figures if made.name == "L")
+        self.notch = NotchFigure(loop, dark, self._notch_moved)
         run, problem = session.run, session.problems.at(session.start)
         self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._moves = True, 0
-        self._scheduled = self._let_go = self._of_search = False
+        self._scheduled = self._let_go = self._of_search = self._notching = False
         self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
@@ -109,20 +111,20 @@ class ExplorerPage:
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
-        self.design = button("Design sections here", "design", self.design_structured)
+        self.design = button("Design sections here", "design", self.design_structured, dark)
         self._designs, self._began = False, session.kappa is not None
-        self.solve_button = button("Solve from here", "solve", self.start_solve)
-        self.stop = button("Stop the solve", "stop", self.stop_solve)
+        self.solve_button = button("Solve from here", "solve", self.start_solve, dark)
+        self.stop = button("Stop the solve", "stop", self.stop_solve, dark)
         self.stop.disabled = True
         self._place()
         self.moved(True)
 
     def _place(self) -> None:
-        buttons = [
-            button("Pin this design", "pin", self.pin), button("Go to selected", "go", self.go),
-            button("Unpin selected", "unpin", self.pins.drop), self.design, self.solve_button,
-            self.stop, button("Save as case", "save", self.write_case),
-        ]  # fmt: skip
+        made = [button(*words, self._dark) for words in (
+            ("Pin this design", "pin", self.pin), ("Go to selected", "go", self.go),
+            ("Unpin selected", "unpin", self.pins.drop), ("Save as case", "save", self.write_case),
+        )]  # fmt: skip
+        buttons = [*made[:3], self.design, self.solve_button, self.stop, made[3]]
         fill: Any = "stretch_width"
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
         roots: dict[str, list[Any]] = {
@@ -132,6 +134,7 @@ class ExplorerPage:
             "buttons_place": [wrapped],
             "pins_place": [self.pins.table],
             "map_place": [self.map.root()],
+            "notch_place": [self.notch.root()],
         } | {f"{made.name}_place": [made.figure] for made in self.figures}
         roots |= {f"{places.name}_place": [places.figure] for places in self.places}
         for name, parts in roots.items():
@@ -210,30 +213,47 @@ class ExplorerPage:
         """Draw a design, and say that this is the answer."""
         sampled = sampled_of(look) if look.knobs.sampled else None
         look = with_sampled(look, sampled)
-        curves = curves_of(look)
-        self.now = now = drawn(look, curves, sampled)
-        session = self.session
+        self._shown = look, curves_of(look), sampled
+        self._paint()
+        self._seen.append(look)
+        if self._first is None and look.how is not How.PRESENT:
+            self._first = "the first one", look.bandwidth_hz
+
+    def _paint(self) -> None:
+        """The present design, with its notch."""
+        look, curves, sampled = self._shown
+        session, view = self.session, None if curves is None else curves.view
+        notched = None if view is None else self.notch.of(view)
+        self.now = now = drawn(look, curves, sampled, notched)
         self._serial += 1
         answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
         pinned = self.pins.pinned
         beside = (pinned[-1][0], pinned[-1][1].look.bandwidth_hz) if pinned else self._first
+        colour, dash = LOOKS[look.standing]
         words = {
             "verdict": standing_html(look, curves, sampled, beside),
             "machine": machine_html(look, session.start.theta, session.reference),
-        } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY))
+            "say_notch": escape(NO_NOTCH if notched is None else notched.words(look.knobs.S_max)),
+        } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY), colour)
              for made in self.figures}  # fmt: skip
         words["say_move"] = move_words(curves)
-        colour, dash = LOOKS[look.standing]
         colour = ON_DARK.get(colour, colour) if self._dark else colour
         frame = look.how is not How.PRESENT and curves is not None
         changes = [change for made in self.figures for change in
                    made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
         changes += [made.marks(look.theta) for made in self.places]
-        changes += [self.map.mark(look.theta), (self.answer, {"data": answer})]
-        self._message.send(words, changes)
-        self._seen.append(look)
-        if self._first is None and look.how is not How.PRESENT:
-            self._first = "the first one", look.bandwidth_hz
+        changes += [self.notch.mark(view), self.map.mark(look.theta)]
+        self._message.send(words, [*changes, (self.answer, {"data": answer})])
+
+    def _notch_moved(self) -> None:
+        """Once for all moves of the pointer that came meanwhile."""
+        if self.now is not None and not self._notching:
+            self._notching = True
+            self.document.add_timeout_callback(self._notch_again, TOGETHER)
+
+    def _notch_again(self) -> None:
+        self._notching = False
+        self._paint()
 
     def settle(self) -> None:
         """When the answer is on its way: write what was looked at, draw the landscape."""

@@ -75,7 +75,7 @@ def packed(changes: Sequence[Change]) -> tuple[list[Any], np.ndarray]:
     return found, np.concatenate([np.empty(0), *arrays])
 
 
-HEIGHT = 230
+HEIGHT = 200
 FEW = 4  # ticks of a linear axis across: a figure may be 240 px wide
 PX = 11.0 / SIZE  # of a pt of its words
 PADDING = 0.1  # of the data, that a linear axis reaches beyond them
@@ -114,7 +114,7 @@ class PanelFigure:
     def _figure(self, x_range: models.Range1d) -> Any:
         made: Any = figure(
             name=self.name, height=HEIGHT, sizing_mode="stretch_width", min_border_left=58,
-            tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above", x_range=x_range,
+            tools="pan,box_zoom,wheel_zoom,reset", toolbar_inner=True, x_range=x_range,
             y_range=models.Range1d(start=1e-3 if self._log_y else -2.0, end=2.0),
             x_axis_type="log" if self._log_x else "linear",
             y_axis_type="log" if self._log_y else "linear",
@@ -123,7 +123,7 @@ class PanelFigure:
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
-            axis.axis_label_text_font_style = "normal"
+            axis.update(axis_label_text_font_style="normal", axis_label_text_font_size="12px")
         if not self._log_x:
             made.xaxis[0].ticker.desired_num_ticks = FEW
         if self._round:
@@ -277,13 +277,14 @@ class PanelFigure:
         return (low - margin if axis else low), high + margin
 
 
-def legend_html(panel: Panel) -> str:
-    """What the curves of a panel are, each in its colour."""
-    items = [(SIGNS.get(c.marker) or SIGNS[c.line], c.colour, c.label) for c in panel.curves]
+def legend_html(panel: Panel, own: str = BLUE) -> str:
+    """What the curves of a panel are, each in its colour: `own` of the present design's."""
+    items = [(SIGNS.get(c.marker) or SIGNS[c.line], own if c.colour == BLUE else c.colour, c.label)
+             for c in panel.curves]  # fmt: skip
     items += [("▬", band.colour, band.label) for band in panel.bands]
     parts = [
-        f'<span style="color:{VARIABLES.get(colour, VARIABLES[BLACK])}">{sign}</span> '
-        f"{escape(label)}"
+        f'<span aria-hidden="true" style="color:{VARIABLES.get(colour, VARIABLES[BLACK])}">{sign}'
+        f"</span> {escape(label)}"
         for sign, colour, label in items
         if label
     ]

@@ -19,6 +19,7 @@ from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
 from ccd_casadi.extensions.explorer.curves import EMPTY, Drawn
 from ccd_casadi.extensions.explorer.designs import Look
 from ccd_casadi.extensions.explorer.knobs import Knobs
+from ccd_casadi.extensions.explorer.landscape_map import MapFigure
 from ccd_casadi.extensions.explorer.painter import ON_DARK, PanelFigure
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import display_unit
@@ -52,11 +53,11 @@ class Pins:
     """Pinned designs, in the order in which they were pinned; a name may be changed in its cell."""
 
     def __init__(
-        self, parameters: Sequence[Parameter], figures: Sequence[PanelFigure], kept: Kept,
-        dark: bool, cost_unit: str,
+        self, parameters: Sequence[Parameter], figures: Sequence[PanelFigure], land: MapFigure,
+        kept: Kept, dark: bool, cost_unit: str,
     ) -> None:  # fmt: skip
         self.names = [p.name for p in parameters]
-        self.figures, self.kept, self._dark = figures, kept, dark
+        self.figures, self.land, self.kept, self._dark = figures, land, kept, dark
         units = [display_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
         self.source = ColumnDataSource(self._columns([]))
@@ -105,6 +106,7 @@ class Pins:
         if len(names) == len(self.pinned):
             pairs = zip(names, self.pinned, strict=True)
             self.pinned[:] = [(str(name), drawn) for name, (_, drawn) in pairs]
+            self._on_map()
 
     def _columns(self, colours: Sequence[str]) -> dict[str, list[Any]]:
         """The table, a list a column; θ in the units of the sliders."""
@@ -118,7 +120,14 @@ class Pins:
             name: json_values([read(look) for look in looks]) for name, *_, read in FIGURES
         }
 
+    def _on_map(self) -> None:
+        """Whoever looks at the table finds each there by colour and name."""
+        rows = enumerate(self.pinned)
+        self.land.pin([(COLOURS[i % len(COLOURS)], name, drawn.look.theta)
+                       for i, (name, drawn) in rows])  # fmt: skip
+
     def _show(self) -> None:
+        self._on_map()
         self.source.selected.indices = []
         colours = [COLOURS[i % len(COLOURS)] for i in range(len(self.pinned))]
         shown = [ON_DARK[colour] if self._dark else colour for colour in colours]

@@ -7,6 +7,7 @@ for (const view of views) {
     view.el.setAttribute("role", "img")
     view.el.setAttribute("aria-label", names[name])
   }
+  view.shadow_el?.querySelector("input[type=checkbox]")?.setAttribute("aria-label", view.model.label)
   const handles = view.shadow_el?.querySelectorAll(".noUi-handle") ?? []
   const told = () => handles.forEach((handle, i) => {
     const said = view.shadow_el.querySelector(".bk-slider-title")?.textContent ?? ""
