@@ -344,10 +344,11 @@ def test_a_changed_controller_is_refused(folder: Path, capsys: pytest.CaptureFix
 
 def test_a_feedforward_for_the_set_settles_on_it_and_learns(folder: Path, tmp_path: Path) -> None:
     move = ["--stroke", "1e-3", "--jerk", "1e4", "--snap", "1e7", "--window", "1e-5", "--quiet"]
+    move += ["--judges", "60"]
     words = [str(folder / "run"), "--out", str(tmp_path), *move]
     assert feedforward_main(words) == 0
     found = json.loads((tmp_path / "feedforward.json").read_text())
-    assert found["kept"] == found["judged"] == 500
+    assert found["kept"] == found["judged"] == 60
     assert found["settled"] <= found["settled_inverse"]
     assert found["peak_force"] <= found["peak_force_inverse"] * 1.002
     assert (tmp_path / "report.html").exists()

@@ -29,6 +29,7 @@ FILE = "feedforward.json"
            "CSV with a line for each sample and a column `error`, or error1, error2, ...: the "
            "controller's error in m"),
     valued("--taps", "N", integer(1, 9), "of the shaper at most; 1: none", 3),
+    valued("--judges", "N", integer(1), "plants of the set that judge the design", 500),
     valued("--axis", "N", integer(1), "output that moves", 1),
     *MOVE_OPTIONS, needs=["ccd_casadi.extensions.feedforward.set_feedforward"], place=RUN,
     without_effect=["--workers"],
@@ -44,7 +45,11 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.feedforward.feedforward_files import entry, summary, write_code
     from ccd_casadi.extensions.feedforward.feedforward_page import feedforward_page
-    from ccd_casadi.extensions.feedforward.set_feedforward import profile_of, set_feedforward
+    from ccd_casadi.extensions.feedforward.set_feedforward import (
+        FeedforwardSetOptions,
+        profile_of,
+        set_feedforward,
+    )
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 
@@ -60,8 +65,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     if options.learn is not None:
         return _learn(run, folder, options.learn)
     found = set_feedforward(
-        run, profile, window, axis=options.axis - 1, taps=options.taps, seed=options.seed
-    )
+        run, profile, window, axis=options.axis - 1, taps=options.taps, seed=options.seed,
+        options=FeedforwardSetOptions(judges=options.judges),
+    )  # fmt: skip
     answer = entry(found, options.axis) | {"seed": options.seed, "versions": versions(),
                                            "seconds": options.seconds()}  # fmt: skip
     write_json(folder / FILE, answer)
