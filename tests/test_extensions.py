@@ -16,6 +16,7 @@ from ccd_casadi.support.extensions import SHIPPED, Extension, shipped
 
 CASE = ROOT / "runs" / "two_mass.toml"
 NAMES = sorted(shipped())
+SHOWN = ("formats", "rib_stage")  # in the suite; a process each
 IMPORTS = """
 import pkgutil, ccd_casadi
 for found in pkgutil.walk_packages(ccd_casadi.__path__, "ccd_casadi."):
@@ -65,7 +66,9 @@ print(json.dumps(answers))
 """
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [n if n in SHOWN else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
+)
 def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: Path) -> None:
     needs = f"needs the extension {name}, which is not installed\n"
     own, asked = shipped()[name], list[tuple[list[str], str]]()

@@ -11,7 +11,7 @@ from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.ports import course
-from ccd_casadi.lti.state_space import closed_loop
+from ccd_casadi.lti.state_space import ClosedLoop, closed_loop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array, states
 
@@ -248,13 +248,8 @@ def simulate(
     ahead = np.zeros((5, loop.plant.B.shape[1]))
     if forces is not None:
         ahead[2 if forces.ndim == 1 else slice(None)] = forces
-    output, reference = course(loop.plant, axis, loop.at)
     closed, tail = closed_loop(*loop.as_run), options.tail / bandwidth_hz
-    rows, wanted = (output @ closed.C_y)[None], np.ones(1)
-    if loop.counted is not None:
-        rows = np.zeros((len(loop.counted), len(closed.A)))
-        rows[:, : len(loop.plant.A)] = loop.counted
-        wanted = loop.ports.wanted[:, 0 if loop.at else axis]
+    rows, wanted, reference = counted_rows(loop, axis, closed)
     ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz
     step = loop.period or float(np.clip(profile.duration / options.steps_per_move, *ends))
     A, drive = _over(loop, ahead, reference, step)
@@ -275,6 +270,35 @@ def simulate(
     error = error[:, 0] if len(wanted) == 1 else error
     return Move(time, r[0], error, force, forces is not None,
                 profile.duration, window, rest=float(np.abs(rest).max()))  # fmt: skip
+
+
+def counted_rows(loop: Loop, axis: int, closed: ClosedLoop) -> tuple[Array, Array, Array]:
+    """Find what counts of a move of one output.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed, SI.
+    axis : int
+        The output, from 0.
+    closed : ClosedLoop
+        Of the loop as it runs.
+
+    Returns
+    -------
+    rows : (q, n) array
+        What counts, in the states of the closed loop: the output, or what the loop's ports count.
+    wanted : (q,) array
+        Of that, where the setpoint is 1.
+    reference : (p,) array
+        Of every output, as of `course`.
+    """
+    output, reference = course(loop.plant, axis, loop.at)
+    if loop.counted is None:
+        return (output @ closed.C_y)[None], np.ones(1), reference
+    rows = np.zeros((len(loop.counted), len(closed.A)))
+    rows[:, : len(loop.plant.A)] = loop.counted
+    return rows, loop.ports.wanted[:, 0 if loop.at else axis], reference
 
 
 def _over(loop: Loop, ahead: Array, reference: Array, step: float) -> tuple[Array, Array]:

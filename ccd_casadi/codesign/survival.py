@@ -25,7 +25,7 @@ from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import least_margins, least_of
-from ccd_casadi.synthesis.statics import Statics, StaticsOptions, statics
+from ccd_casadi.synthesis.statics import Statics, StaticsOptions, statics_of
 
 PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
 STATED = 2.0 * PEAK  # the excess of S_max from which on the words state it
@@ -405,7 +405,7 @@ def survival(
     `marks`: shifts that are evaluated too, on both sides.
     """
     nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
-    own = loops.ported or nominal
+    own = replace(loops.ported or nominal, controller=loops.controller)
     denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
     if nominal.stable and not nominal.peak <= level:
         denied = f"a second engine finds a peak of S of {nominal.peak:.6g} on the model itself"
@@ -426,14 +426,7 @@ def survival(
         delay=margins.delay,
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
-        statics=statics(
-            own.plant,
-            loops.controller,
-            bandwidth=bandwidth,
-            omega_low=omega_low,
-            places=loops.places,
-            ports=own.ports if own.ported else None,
-        ),
+        statics=statics_of(own, bandwidth=bandwidth, omega_low=omega_low),
         contradiction=denied,
         S_max_slack=exceeded,
     )

@@ -56,7 +56,7 @@ from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.statics import compliance_of, statics
+from ccd_casadi.synthesis.statics import compliance_of, statics_of
 
 
 @dataclass(frozen=True)
@@ -373,8 +373,8 @@ def _assessed(
     K, fixed = realisation.system, realisation.fixed
     figures = {at: loop_figures(closed_loop(G, K), places) for at, G in held.items()}
     loop = run.loop
-    at_rest = statics(loop.plant, K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low,
-                      places=places, ports=loop.ports if loop.ported else None)  # fmt: skip
+    own = replace(loop, controller=K)
+    at_rest = statics_of(own, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low)
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
         most = structured_of(run.problem).compliance_max

@@ -43,7 +43,7 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.statics import Statics, statics
+from ccd_casadi.synthesis.statics import Statics, statics_of
 
 
 @dataclass(frozen=True)
@@ -145,14 +145,7 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         peaks=peaks(),
         margins=margins(replace(loop, at=()).responses, hz),  # broken at every sensor and input
         noise=noise(loop, d.sensor, d.disturbance),
-        statics=statics(
-            loop.plant,
-            loop.controller,
-            bandwidth=omega_b,
-            omega_low=low,
-            places=loop.at,
-            ports=loop.ports if loop.ported else None,
-        ),
+        statics=statics_of(loop, bandwidth=omega_b, omega_low=low),
         shift=shift_line(run, d.shift),
         damping=damping_line(run, *d.damping),
         modes=single_modes(run, d.shift),

@@ -87,6 +87,24 @@ class Statics:
         return found
 
 
+def statics_of(loop: Loop, *, bandwidth: float, omega_low: float) -> Statics:
+    """`statics` of a loop's own plant and controller, at its places and ports.
+
+    Parameters
+    ----------
+    loop : Loop
+        SI.
+    bandwidth, omega_low : float
+        rad/s.
+
+    Returns
+    -------
+    Statics
+    """
+    return statics(loop.plant, loop.controller, bandwidth=bandwidth, omega_low=omega_low,
+                   places=loop.at, ports=loop.ports if loop.ported else None)  # fmt: skip
+
+
 def statics(
     plant: StateSpace,
     controller: StateSpace,

@@ -58,6 +58,7 @@ def copy(retrained: tuple[Path, RetrainingEnd, Solution], tmp_path: Path) -> Pat
     return Path(shutil.copytree(retrained[0], tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_few_syntheses_reach_the_optimum(retrained: tuple[Path, RetrainingEnd, Solution]) -> None:
     _, outcome, solution = retrained
     assert (outcome.status, outcome.reason) == ("verified", "converged")
@@ -109,6 +110,7 @@ def test_an_interrupted_job_resumes(
     assert outcome.spent <= retrained[1].spent + 5, "what was sampled is used"
 
 
+@pytest.mark.slow
 def test_a_budget_ends_a_job_and_is_the_folders(tmp_path: Path) -> None:
     """A `direct` run keeps its name; it was called `lifted` once it had been trained again."""
     outcome, (solution,) = job(tmp_path, "direct", budget=FIRST + 1, tolerance=1e-12)

@@ -42,7 +42,9 @@ KEYS = {
 CERTIFICATE = {"stable", "max_real_pole", "norm", "norm_bound", "passed"}
 
 
-@pytest.mark.parametrize("formulation", ["nested", "lifted", "direct"])
+@pytest.mark.parametrize(
+    "formulation", [pytest.param("nested", marks=pytest.mark.slow), "lifted", "direct"]
+)
 def test_case_study_1_is_solved_and_verified(
     solved: Callable[[str], Path], formulation: str
 ) -> None:
@@ -235,6 +237,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 # ---- constraints, and cases that cannot be solved ------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> None:
     quick = "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\nbox_points = 0\n"
     case = own_plant(tmp_path, 118.0, quick + "direct_starts = 1\n")

@@ -54,6 +54,7 @@ def test_the_gain_is_that_of_a_full_solve(tmp_path, capsys) -> None:
     assert 0.0 <= found["uncertainty_percent"] < 1.0
 
 
+@pytest.mark.slow
 def test_a_round_is_expected_to_gain_less_the_more_true_designs_there_are(tmp_path) -> None:
     """δ covers what the next rounds gain, and falls below what ends them."""
     problem, seed = problem_of(load_case(TWO_MASS)), 0

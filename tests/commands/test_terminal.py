@@ -45,6 +45,7 @@ def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
     assert "left" not in ends[0]
 
 
+@pytest.mark.slow
 def test_the_table_of_back_ends_holds_80_characters() -> None:
     at = ["--theta", "m1=60,m2=60", "--omega-s-hz", "900", "--omega-t-hz", "25"]
     lines = on_screen(80, "cross_check", str(ccd_casadi.TWO_MASS), *at)

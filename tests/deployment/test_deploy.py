@@ -186,6 +186,7 @@ def test_the_command_leaves_a_controller_that_can_be_built(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_rate_that_does_not_do_names_the_one_that_does(
     two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -95,6 +95,7 @@ def test_a_bound_on_the_compliance_is_kept_or_told(
     assert "resonances +2 %" in broken.shortfalls[0]
 
 
+@pytest.mark.slow
 def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(
     deployed: tuple[FinishedRun, Deployment],
 ) -> None:

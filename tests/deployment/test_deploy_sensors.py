@@ -81,13 +81,16 @@ def test_a_place_that_exceeds_S_max_alone_fails(tmp_path: Path) -> None:
     assert over[-1] == f"S_max of {('motor', 'table', 'actuator')[int(peaks.argmax())]}"
 
 
-@pytest.mark.parametrize(("rate", "delay"), [(8000.0, 250e-6), (12800.0, 20e-6)])
+@pytest.mark.parametrize(
+    ("rate", "delay"), [pytest.param(8000.0, 250e-6, marks=pytest.mark.slow), (12800.0, 20e-6)]
+)
 def test_at_another_rate_and_delay(tmp_path: Path, rate: float, delay: float) -> None:
     found = deploy(by_hand(tmp_path), Timing(rate, delay))
     S = broken(found.realisation.system, delay)[1]
     assert found.sampled.sensitivity_peak == pytest.approx(S.max(), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_continuous_design_gets_a_rate_at_which_every_place_is_kept(tmp_path: Path) -> None:
     table = "[loop]\nrate_hz = 8000.0\ndelay_us = 187.5\n"
     run = by_hand(tmp_path, S_max=1.7, loop=(table, ""))
@@ -190,6 +193,7 @@ def test_sensors_with_a_spring_follow_as_they_are_moved_slowly() -> None:
     np.testing.assert_allclose(course(G, 0, at)[1], static / static[1], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_robustness_judges_the_deployed_controller_at_every_place(
     deployed: tuple[FinishedRun, Deployment], tmp_path: Path
 ) -> None:

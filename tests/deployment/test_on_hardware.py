@@ -292,7 +292,8 @@ def test_a_move_within_a_limit_settles_fails_or_is_not_known() -> None:
     """The limited move of the loop as it is deployed decides, with the electronics where given."""
     limits = MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4)
     G, K = stage(), pid()
-    known = partial(on_hardware, G, delay=DELAY, bandwidth=CROSSOVER, limits=limits, window=1e-4)
+    known = partial(on_hardware, G, delay=DELAY, bandwidth=CROSSOVER, limits=limits, window=1e-4,
+                    options=replace(SimulationOptions(), shares=()))  # fmt: skip
     unlimited = known(K)
     assert unlimited.limited_entry is None
     peak = float(unlimited.ways["with feedforward"].peak_force.max())

@@ -138,6 +138,7 @@ def test_rows_have_exact_slopes() -> None:
         np.testing.assert_allclose(slopes[:, i], (ahead - back) / 2e-6, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_design_is_on_the_grid_verified_and_proven() -> None:
     few = DriveOptions(search=SearchOptions(starts=1, stages=((0.4, 20),)))
     found = design_drive(cascade("sinamics_s120"), uncertain(), bounds(), RATE, options=few)

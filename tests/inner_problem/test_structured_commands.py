@@ -14,6 +14,8 @@ from oracles.case_documents import QUICK_SECTIONS as QUICK
 from oracles.contradictions import contradictions
 from oracles.helpers import problem
 
+from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
@@ -23,6 +25,8 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.extensions.feedforward.feedforward_command import main as feedforward_main
+from ccd_casadi.extensions.feedforward.move_responses import Shape, responses_of
 from ccd_casadi.extensions.limitations.gap_command import main as gap_main
 from ccd_casadi.extensions.limitations.limits import discs
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
@@ -48,7 +52,6 @@ from ccd_casadi.synthesis.synthesis import synthesise
 from surrogates.retrain import main as retrain_main
 
 COMMON = ["--quiet", "--workers", "1"]
-
 
 
 @pytest.fixture(scope="module")
@@ -337,3 +340,32 @@ def test_a_changed_controller_is_refused(folder: Path, capsys: pytest.CaptureFix
     shutil.copy(folder / "run" / "controller.json", changed / "controller.json")
     assert insight_main([str(changed), *COMMON]) == 2
     assert "anchors" in capsys.readouterr().err
+
+
+def test_a_feedforward_for_the_set_settles_on_it_and_learns(folder: Path, tmp_path: Path) -> None:
+    move = ["--stroke", "1e-3", "--jerk", "1e4", "--snap", "1e7", "--window", "1e-5", "--quiet"]
+    move += ["--judges", "60"]
+    words = [str(folder / "run"), "--out", str(tmp_path), *move]
+    assert feedforward_main(words) == 0
+    found = json.loads((tmp_path / "feedforward.json").read_text())
+    assert found["kept"] == found["judged"] == 60
+    assert found["settled"] <= found["settled_inverse"]
+    assert found["peak_force"] <= found["peak_force_inverse"] * 1.002
+    assert (tmp_path / "report.html").exists()
+    # a move of a machine whose gain is 5 % higher
+    run = as_it_runs(read_run(folder / "run"))
+    G = run.plant.plant_si()
+    shape = Shape(tuple(found["orders"]), 1, found["taps"], found["spacing"])
+    profile = setpoint(MoveLimits(1e-3, 0.1, 2.0, 1e4, 1e7))
+    machine = responses_of(run.loop_on(replace(G, B=1.05 * G.B)), profile, shape.orders, axis=0,
+                           samples=found["samples"]).shaped(shape)  # fmt: skip
+
+    def error() -> np.ndarray:
+        now = json.loads((tmp_path / "feedforward.json").read_text())
+        x = shape.joined(np.array(now["shaper"]), np.array(now["forces"]))
+        return machine.tracking(x, shape)
+
+    before = error()
+    np.savetxt(tmp_path / "log.csv", before, header="error", comments="")
+    assert feedforward_main([*words, "--learn", str(tmp_path / "log.csv")]) == 0
+    assert np.linalg.norm(error()) < 0.5 * np.linalg.norm(before)

@@ -152,7 +152,7 @@ def norms(plant: ScaledPlant, controller: StateSpace, weights: Weights):
     return norm, lambda claim: level_test(G, K, Dk, w, 0.0, loop, claim)
 
 
-@few(max_examples=12)
+@few(max_examples=5)
 @example(55.0, 55.56757267047337, 1.0, 2.625, -5.0)
 @given(masses, masses, exponents_S, exponents_T, st.floats(-5.0, -0.5))
 def test_claim_below_the_norm_is_refused_by_grid_and_level_test(m1, m2, S, T, exponent) -> None:

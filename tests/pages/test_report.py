@@ -328,6 +328,7 @@ def test_a_page_is_drawn_again_from_its_folder_alone(
     assert (again / "report.html").read_text(encoding="utf-8") == first
 
 
+@pytest.mark.slow
 def test_a_run_without_one_gets_a_report_of_its_design(
     two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,6 +40,7 @@ def strengths(system: Mechanics) -> Array:
     return np.asarray(system.C.T[:, :, None] * system.B[:, None, :])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "within"),
     [(BARE, 1e-7), *(pytest.param(s, 1e-3, marks=pytest.mark.slow) for s in (LOADED, FADING))],

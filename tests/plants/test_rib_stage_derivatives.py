@@ -60,7 +60,7 @@ def test_slopes_are_differences(theta: tuple[float, ...], index: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(s, marks=pytest.mark.slow) if s == "lopsided" else s for s in STAGES]
+    "name", [pytest.param(s, marks=pytest.mark.slow) if s != "moved" else s for s in STAGES]
 )
 def test_slopes_along_a_mixed_direction(name: str) -> None:
     stage = STAGES[name]
@@ -88,6 +88,7 @@ def response_slopes(stage: RibStage, omega: float) -> np.ndarray:
     return dC @ R @ system.B + system.C @ R @ dB - system.C @ R @ dK @ R @ system.B
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omega", [300.0, 1500.0, 6000.0])
 def test_double_frequencies_without_symmetry_to_name_them(omega: float) -> None:
     """A speck leaves the pairs double in the whole model: responses move as in sectors."""

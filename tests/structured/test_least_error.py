@@ -105,6 +105,7 @@ def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
     assert (twice.value, twice.steps) == (alone.value, alone.steps)
 
 
+@pytest.mark.slow
 def test_descents_end_alike_on_any_number_of_workers() -> None:
     plants = [plant(0.01)]
     problem, kappa = loop(0, PID, FAST)

@@ -233,6 +233,7 @@ def built() -> tuple[CoDesignProblem, Limits, float]:
     return problem, limits, upper_bound(limits)
 
 
+@pytest.mark.slow
 def test_case_study_1_is_bracketed() -> None:
     """Continuous and as it runs: the bracket's width is measured as 4 and 5 %; 15 % is asked."""
     _, limits, most = built()

@@ -1,6 +1,7 @@
 """Budget and move of several sensors on one actuator, by formulas of its own."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,11 @@ from ccd_casadi.support.text import HZ
 
 LOOP = "[loop]\nrate_hz = 8000.0\ndelay_us = 187.5\n"
 KINDS = (SourceKind.FORCE, SourceKind.SENSOR_NOISE, SourceKind.SETPOINT)
+
+
+def some(suite: SourceKind) -> list[Any]:
+    """All kinds, of which the suite has one."""
+    return [kind if kind is suite else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 MOVE = """[move]
 distance = 0.05
 velocity = 0.5
@@ -65,7 +71,7 @@ def response(s: np.ndarray, A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return np.linalg.solve(s[:, None, None] * np.eye(4) - A, B + 0j)[:, :2, 0]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", some(SourceKind.SENSOR_NOISE))
 def test_a_continuous_budget_is_the_integral_of_its_fractions(
     tmp_path: Path, kind: SourceKind
 ) -> None:
@@ -83,7 +89,7 @@ def test_a_continuous_budget_is_the_integral_of_its_fractions(
     assert found.error**2 == pytest.approx(own, rel=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", some(SourceKind.FORCE))
 def test_a_table_in_a_sampled_loop_is_the_integral_of_its_fractions(
     tmp_path: Path, kind: SourceKind
 ) -> None:

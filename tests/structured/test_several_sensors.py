@@ -346,6 +346,7 @@ def test_a_sensor_may_have_any_unit(units: tuple[float, float]) -> None:
         assert highest(other, kappa + shift) == pytest.approx(highest(metres, kappa), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_design_in_millimetres_is_that_in_metres() -> None:
     plant, made = two_masses(), design()
     units = np.array([1e3, 1.0])

@@ -56,6 +56,7 @@ def test_the_worst_plant_of_every_disc_is_within_S_max(tuned: Tuned) -> None:
         assert (1.0 / np.abs(1.0 + L + 0.15 * np.abs(L) * disc) <= S * (1.0 + 1e-9)).all()
 
 
+@pytest.mark.slow
 def test_a_spread_costs_bandwidth_and_a_factor_of_0_ignores_it(tuned: Tuned) -> None:
     plain = tune(response(0.15), rate_hz=RATE, starts=4, spread=0.0)
     none = tune(response(0.0), rate_hz=RATE, starts=4)

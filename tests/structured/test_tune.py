@@ -237,6 +237,7 @@ def test_what_is_no_plant_is_said(plant: object, how: dict, words: str) -> None:
         ccd.tune(plant, **how)
 
 
+@pytest.mark.slow
 def test_what_no_pid_stabilises_is_said() -> None:
     found = ccd.tune(1.0 / (s - 1.0), rate_hz=50.0, delay=2.0, starts=2)
     assert found.controller is None

@@ -1,0 +1,191 @@
+"""What the coefficients of a feedforward and of a shaper move: responses of closed loops.
+
+The controller takes r̃ and f, both sums of delayed signals of one setpoint r:
+
+    r̃_k = Σ_i h_i r_{k - i d},   f_k = Σ_i Σ_j F_ij r^(j)_{k - i d},   Σ_i h_i = 1
+
+From rest, what a sampled loop reaches and the force of its motors are linear in x = [h, F]:
+
+    y = Y x,   u = U x
+
+A delay of i d samples delays a response by as much, so that each is computed once.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.analysis.move import counted_rows, held_setpoint
+from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import closed_loop
+from ccd_casadi.support.arrays import Array, states
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Which coefficients there are.
+
+    Attributes
+    ----------
+    orders : tuple of int
+        Derivatives of the setpoint that have a force.
+    forces : int
+        m, of the plant.
+    taps : int
+        Of every signal, the first without delay.
+    spacing : int
+        d, samples from tap to tap.
+    """
+
+    orders: tuple[int, ...]
+    forces: int
+    taps: int = 1
+    spacing: int = 1
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return self.taps * (1 + len(self.orders) * self.forces)
+
+    @property
+    def last(self) -> int:
+        """Samples by which the last tap is late."""
+        return (self.taps - 1) * self.spacing
+
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """h (taps,) and F (taps, 5, m), by derivative of the setpoint."""
+        h, rest = x[: self.taps], x[self.taps :]
+        F = np.zeros((self.taps, 5, self.forces))
+        F[:, self.orders] = rest.reshape(self.taps, len(self.orders), self.forces)
+        return h, F
+
+    def joined(self, h: Array, F: Array) -> Array:
+        """x of h (taps,) and F (taps, 5, m); fewer taps are filled with zeros."""
+        more = self.taps - len(h)
+        h, F = np.append(h, np.zeros(more)), np.concatenate([F, np.zeros((more, *F.shape[1:]))])
+        return np.append(h, F[:, self.orders].ravel())
+
+
+@dataclass(frozen=True)
+class MoveResponses:
+    """One plant's move, by coefficients of one tap.
+
+    Attributes
+    ----------
+    period : float
+        T, s.
+    reached : (N, q, c) array
+        What counts, per coefficient, unit of y; the first is of the setpoint itself.
+    force : (N, m, c) array
+        N.
+    setpoint : (N, q) array
+        What is wanted of that without a shaper; the last is where the move ends.
+    """
+
+    period: float
+    reached: Array
+    force: Array
+    setpoint: Array
+
+    @property
+    def end(self) -> Array:
+        """Where the move ends (q,)."""
+        return np.asarray(self.setpoint[-1])
+
+    def shaped(self, shape: Shape) -> "MoveResponses":
+        """With all taps, coefficients in the order of `Shape`."""
+        return replace(self, reached=_tapped(self.reached, shape), force=_tapped(self.force, shape))
+
+    def error(self, x: Array) -> Array:
+        """What is left to the end of the move (N, q)."""
+        return np.asarray(self.end - self.reached @ x)
+
+    def tracking(self, x: Array, shape: Shape) -> Array:
+        """The controller's error (N, q), to the shaped setpoint; with all taps."""
+        h, _ = shape.split(x)
+        wanted = [h[i] * _later(self.setpoint, i * shape.spacing) for i in range(shape.taps)]
+        return np.asarray(sum(wanted) - self.reached @ x)
+
+    def settled(self, x: Array, window: float) -> float:
+        """From when on the error stays within `window`, s; infinite where it does not at last, and
+        where one is not finite."""
+        error = np.abs(self.error(x)).max(axis=1)
+        outside = np.flatnonzero(~(error <= window))
+        if not outside.size:
+            return 0.0
+        later = outside[-1] + 1
+        return self.period * float(later) if later < len(error) else np.inf
+
+    def heat(self, x: Array) -> float:
+        """∫ |u|² dt, N² s."""
+        return self.period * float(((self.force @ x) ** 2).sum())
+
+    def peak(self, x: Array) -> float:
+        """The largest force of any motor, N."""
+        return float(np.abs(self.force @ x).max())
+
+
+def _tapped(response: Array, shape: Shape) -> Array:
+    """(N, q, taps c) of (N, q, c): taps of the setpoint, then tap by tap all forces."""
+    later = [_later(response, shape.spacing * i) for i in range(shape.taps)]
+    return np.concatenate([one[..., :1] for one in later] + [one[..., 1:] for one in later], axis=2)
+
+
+def _later(signal: Array, samples: int) -> Array:
+    """A signal that begins at rest, later."""
+    return np.concatenate([np.zeros_like(signal[:samples]), signal[: len(signal) - samples]])
+
+
+def responses_of(
+    loop: Loop, profile: Setpoint, orders: tuple[int, ...], *, axis: int, samples: int
+) -> MoveResponses:
+    """Respond to a setpoint and to a force of each of its derivatives at each motor.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed, sampled, SI.
+    profile : Setpoint
+        Of the output `axis`; the others stay at 0.
+    orders : tuple of int
+        Derivatives that have a force.
+    axis, samples : int
+        From 0; N.
+
+    Returns
+    -------
+    MoveResponses
+
+    Raises
+    ------
+    UserError
+        The loop is continuous, or not stable.
+    """
+    if loop.sampling is None:
+        raise UserError("feedforward: needs a sampled loop; deploy it, and give --controller")
+    G, K = loop.as_run
+    closed, period = closed_loop(G, K), loop.sampling.period
+    if not np.abs(np.linalg.eigvals(closed.A)).max() < 1.0:
+        raise UserError("feedforward: the loop is not stable on every plant of its set")
+    rows, wanted, reference = counted_rows(loop, axis, closed)
+    if not (loop.at or loop.ported):  # the other axes have to stay
+        rows, wanted = closed.C_y, reference
+    m, n = G.B.shape[1], len(closed.A)
+    r = held_setpoint(profile, period * np.arange(samples, dtype=float), period)
+    driven = [np.outer(r[0], closed.B_r @ reference)]
+    ahead = [np.outer(r[0], closed.D_u @ reference)]
+    for order in orders:
+        for motor in range(m):
+            signal = np.zeros((samples, n))
+            signal[:, : len(G.A)] = np.outer(r[order], G.B[:, motor])
+            driven.append(signal)
+            ahead.append(np.outer(r[order], np.eye(m)[motor]))
+    x = [states(closed.A, signal) for signal in driven]
+    return MoveResponses(
+        period,
+        np.stack([one @ rows.T for one in x], axis=2),
+        np.stack([one @ closed.C_u.T + more for one, more in zip(x, ahead, strict=True)], axis=2),
+        np.outer(r[0], wanted),
+    )

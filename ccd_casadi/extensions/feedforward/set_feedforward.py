@@ -1,0 +1,265 @@
+"""Feedforward and shaper of a run's move for every plant of its set.
+
+The model's inverse settles on the model; on the plants beside it what it leaves rings. Here the
+coefficients are those with which the latest plant of the set settles at the earliest
+(`least_time`), with no more heat and no more peak force than the inverse needs. Plants that are
+drawn join the design where they settle later; others, which no step has seen, judge it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.on_hardware import forward_of
+from ccd_casadi.deployment.robust_set import members
+from ccd_casadi.extensions.feedforward.learning import contraction, learning_gain
+from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTime, least_time
+from ccd_casadi.extensions.feedforward.move_responses import MoveResponses, Shape, responses_of
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class FeedforwardSetOptions:
+    """Numbers of the design for a set.
+
+    Attributes
+    ----------
+    drawn, added, rounds : int
+        Plants that are drawn after a design, those of them that join it at most, and how often.
+    judges : int
+        Plants that judge the last design.
+    tail : float
+        What is simulated after the setpoint, over its duration, doubled until the model's inverse
+        has settled on every plant.
+    doublings : int
+        At most.
+    spreads : tuple of float
+        Delays of the last tap that are tried, in periods of the lowest flexible mode.
+    worth : float
+        More taps have to settle earlier by this share.
+    """
+
+    drawn: int = 200
+    added: int = 5
+    rounds: int = 4
+    judges: int = 500
+    tail: float = 3.0
+    doublings: int = 4
+    spreads: tuple[float, ...] = (0.5, 1.0)
+    worth: float = 0.05
+
+
+@dataclass(frozen=True)
+class SetFeedforward:
+    """A feedforward and what it does.
+
+    Attributes
+    ----------
+    found : LeastTime
+    inverse : (c,) array
+        The model's inverse as coefficients of one tap.
+    profile : Setpoint
+    window : float
+        Unit of y.
+    responses : tuple of MoveResponses
+        Of the plants of the design, the model's first; of one tap.
+    settled, settled_inverse : (plants,) array
+        When each has settled, s: with what was found and with the inverse.
+    judged, judged_inverse : (draws,) array
+        Of the plants that judge; empty where the run has no box to draw from.
+    limits : ForceLimits
+        What the inverse needs.
+    heat, peak : float
+        The largest of the design's plants, N² s and N.
+    contraction : float
+        ρ of `learning`, of the design's plants.
+    """
+
+    found: LeastTime
+    inverse: Array
+    profile: Setpoint
+    window: float
+    responses: tuple[MoveResponses, ...]
+    settled: Array
+    settled_inverse: Array
+    judged: Array
+    judged_inverse: Array
+    limits: ForceLimits
+    heat: float
+    peak: float
+    contraction: float
+
+    @property
+    def latest(self) -> float:
+        """When the last plant has settled, s; those that judge count too."""
+        return float(max(self.settled.max(), self.judged.max(initial=0.0)))
+
+    @property
+    def latest_inverse(self) -> float:
+        """The same with the model's inverse."""
+        return float(max(self.settled_inverse.max(), self.judged_inverse.max(initial=0.0)))
+
+    @property
+    def kept(self) -> int:
+        """How many of the plants that judge have settled by the time of the design."""
+        return int((self.judged <= self.found.time).sum())
+
+
+def set_feedforward(
+    run: FinishedRun,
+    profile: Setpoint,
+    window: float,
+    *,
+    axis: int = 0,
+    taps: int = 3,
+    seed: int = 0,
+    options: FeedforwardSetOptions = FeedforwardSetOptions(),
+) -> SetFeedforward:
+    """Find the feedforward, and at most `taps` taps of the shaper, for the set of a run.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        With a sampled loop.
+    profile : Setpoint
+        Of the output `axis`, from 0.
+    window : float
+        In which the move has settled, unit of y.
+    axis, taps, seed : int
+        Of the plants that are drawn.
+    options : FeedforwardSetOptions
+
+    Returns
+    -------
+    SetFeedforward
+
+    Raises
+    ------
+    UserError
+        The loop is continuous, or no coefficients settle on all plants.
+    """
+    model, orders, inverse = _inverse(run, axis)
+    plants = [model, *(member.plant.plant_si() for member in members(run, dense=True))]
+    one, samples = Shape(orders, model.B.shape[1]), 0
+    x = one.joined(np.ones(1), inverse[None])
+    respond = partial(_responses, run, profile=profile, orders=orders, axis=axis)
+    for doubling in range(options.doublings + 1):
+        length = profile.duration * (1.0 + options.tail * 2.0**doubling)
+        samples = int(np.ceil(length * _rate(run)))
+        responses = respond(plants, samples=samples)
+        late = np.array([response.settled(x, window) for response in responses])
+        if (late < 0.75 * length).all():  # no beat comes after it
+            break
+    limits = ForceLimits(max(item.peak(x) for item in responses),
+                         max(item.heat(x) for item in responses))  # fmt: skip
+    latest = float(np.minimum(late, length).max())
+    found = _best(responses, _shapes(run, one, taps, options), x, window, limits, latest, options)
+    for i in range(options.rounds):
+        more = respond(_drawn(run, options.drawn, [seed, 1 + i]), samples=samples)
+        times = np.array([one.shaped(found.shape).settled(found.x, window) for one in more])
+        worst = np.argsort(-times)[: options.added]
+        worst = worst[times[worst] > found.time]
+        if not worst.size:
+            break
+        responses += [more[i] for i in worst]
+        found = _best(responses, [found.shape], x, window, limits, length, options)
+    judges = respond(_drawn(run, options.judges, [seed, 0]), samples=samples)
+
+    def times_of(some: Sequence[MoveResponses], shape: Shape, x: Array) -> Array:
+        return np.array([each.shaped(shape).settled(x, window) for each in some])
+
+    shaped = [each.shaped(found.shape) for each in responses]
+    gain = learning_gain(shaped[0], found.shape)
+    return SetFeedforward(
+        found, x, profile, window, tuple(responses),
+        times_of(responses, found.shape, found.x), times_of(responses, one, x),
+        times_of(judges, found.shape, found.x), times_of(judges, one, x), limits,
+        max(each.heat(found.x) for each in shaped), max(each.peak(found.x) for each in shaped),
+        contraction(shaped, gain, found.shape),
+    )  # fmt: skip
+
+
+def _rate(run: FinishedRun) -> float:
+    sampling = run.loop.sampling
+    if sampling is None:
+        words = "the loop of this run is continuous; deploy it and give its controller.json"
+        raise UserError(f"{run.folder}: {words} by --controller")
+    return sampling.rate_hz
+
+
+def _inverse(run: FinishedRun, axis: int) -> tuple[StateSpace, tuple[int, ...], Array]:
+    """The model, the derivatives that its inverse has a force of, and that (5, m)."""
+    loop = run.loop
+    _rate(run)
+    assert loop.sampling is not None
+    forward = forward_of(loop.plant, loop.sampling.period, loop.sampling.delay, loop.at)
+    F = forward.sum(axis=2) if loop.at else forward[:, :, axis]
+    return loop.plant, tuple(np.flatnonzero(F.any(axis=1)).tolist()), F
+
+
+def _responses(
+    run: FinishedRun, plants: Sequence[StateSpace], *, profile: Setpoint,
+    orders: tuple[int, ...], axis: int, samples: int,
+) -> list[MoveResponses]:  # fmt: skip
+    return [responses_of(run.loop_on(plant), profile, orders, axis=axis, samples=samples)
+            for plant in plants]  # fmt: skip
+
+
+def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+    """Plants from the box of a run; none where it has none."""
+    if not kind_of(run.problem).as_designed:
+        return []
+    uncertain = uncertain_plant(run.problem, run.theta)
+    if not uncertain.names and len(uncertain.options) == 1:
+        return []
+    points = uncertain.drawn(np.random.default_rng(seed), count)
+    return [plant.plant_si() for plant in uncertain.plants(points)]
+
+
+def _shapes(run: FinishedRun, one: Shape, taps: int, options: FeedforwardSetOptions) -> list[Shape]:
+    """Without a shaper, and with the taps spread over parts of a period of the lowest mode."""
+    modal = run.modal()
+    flexible = np.diag(modal.K)[~modal.rigid]
+    flexible = flexible[flexible > 0.0]
+    if taps == 1 or not flexible.size:
+        return [one]
+    period = 2.0 * np.pi / float(np.sqrt(flexible.min()))
+    spacings = [round(share * period * _rate(run) / (taps - 1)) for share in options.spreads]
+    return [one, *(replace(one, taps=taps, spacing=max(d, 1)) for d in dict.fromkeys(spacings))]
+
+
+def _best(
+    responses: Sequence[MoveResponses], shapes: Sequence[Shape], inverse: Array, window: float,
+    limits: ForceLimits, latest: float, options: FeedforwardSetOptions,
+) -> LeastTime:  # fmt: skip
+    """The earliest of some shapes; one with more taps where it is earlier by its worth."""
+    best: LeastTime | None = None
+    for shape in shapes:
+        h, F = replace(shape, taps=1).split(inverse)
+        end = latest if best is None else best.time * (1.0 - options.worth)
+        found = least_time(responses, shape, window, limits, end, shape.joined(h, F))
+        best = found or best
+    if best is None:
+        raise UserError(
+            f"feedforward: no coefficients settle within {window:g} on all plants by "
+            f"{1e3 * latest:.4g} ms with the forces of the model's inverse; give a wider --window "
+            "or a slower move"
+        )
+    return best
+
+
+def profile_of(run: FinishedRun) -> tuple[Setpoint, float] | None:
+    """The move and the window of a run's case; None where it has no [move]."""
+    if run.problem.source.motion is None:
+        return None
+    motion = motion_of(run.problem, run.theta)
+    return motion.cycle.profile, motion.motion.window
