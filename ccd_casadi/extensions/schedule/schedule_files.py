@@ -1,0 +1,206 @@
+"""A schedule judged at positions of its range, and what it leaves in its folder."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.analysis.sampled_figures import loop_figures
+from ccd_casadi.codesign.result_entries import proof_dict, sections_controller
+from ccd_casadi.deployment.realisation import literal, literals, takeover
+from ccd_casadi.extensions.schedule.handover import RateOptions, RateTrial, controllers_of
+from ccd_casadi.extensions.schedule.segments import Alone, Segment, within
+from ccd_casadi.fixed_structure.judgement import judge_loops
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_plant_set import (
+    bounds_of,
+    structure_of,
+    structured_of,
+    uncertain_plant,
+)
+from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.state_space import closed_loop
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.json_files import json_values
+from ccd_casadi.support.text import HZ, counted, template
+
+CODE = ("schedule.h", "schedule.c")
+
+
+@dataclass(frozen=True)
+class FrozenPosition:
+    """A position at rest, with each part that may control there.
+
+    Attributes
+    ----------
+    at : float
+    passed : bool
+        Every bound on the plants of the set there.
+    bandwidth : float
+        On the model there, the slowest of the parts, rad/s.
+    """
+
+    at: float
+    passed: bool
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A schedule and what is known of it.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the parameter that is measured.
+    segments : tuple of Segment
+    alone : tuple of Alone
+    whole : float
+        ω_b of one controller for all of the range, rad/s.
+    frozen : tuple of FrozenPosition
+    rates : tuple of RateTrial
+    """
+
+    name: str
+    unit: str
+    segments: tuple[Segment, ...]
+    alone: tuple[Alone, ...]
+    whole: float
+    frozen: tuple[FrozenPosition, ...]
+    rates: tuple[RateTrial, ...]
+
+    @property
+    def verified(self) -> bool:
+        """Every part judged well and not refuted, every position too, and a rate allowed."""
+        parts = all(one.passed for one in self.segments)
+        return parts and all(one.passed for one in self.frozen) and self.allowed > 0.0
+
+    @property
+    def proven(self) -> int:
+        """Parts on all of which every bound is proven."""
+        return sum(segment.proof.proven for segment in self.segments)
+
+    @property
+    def allowed(self) -> float:
+        """The highest rate of the simulation that is allowed; 0: none."""
+        kept = [one.rate for one in self.rates if one.rise <= RateOptions().rise]
+        return max(kept, default=0.0)
+
+    @property
+    def least_share(self) -> float:
+        """Of ω_b over that of a position alone, the least of the positions of `alone`."""
+        places = [one.at for one in self.frozen]
+        found = np.interp([one.at for one in self.alone], places,
+                          [one.bandwidth for one in self.frozen])  # fmt: skip
+        return min(own / one.bandwidth if one.bandwidth else np.inf
+                   for own, one in zip(found.tolist(), self.alone, strict=True))  # fmt: skip
+
+
+def frozen_positions(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
+    positions: Sequence[float],
+) -> list[FrozenPosition]:  # fmt: skip
+    """Judge every part where it may control, on the model and the corners of its set there.
+
+    Parameters
+    ----------
+    problem, theta, name : CoDesignProblem, sequence of float, str
+    segments : sequence of Segment
+    positions : sequence of float
+
+    Returns
+    -------
+    list of FrozenPosition
+    """
+    sampling, bounds = structured_of(problem).sampling, bounds_of(problem)
+    assert sampling is not None
+    K, integrator = controllers_of(segments, sampling), structure_of(problem).integrator
+    found = []
+    for p in positions:
+        own = uncertain_plant(within(problem, name, p, p), theta)
+        plants = own.as_written(own.corners())
+        passed, bandwidth = True, np.inf
+        for one, coded in zip(segments, K, strict=True):
+            if not one.low <= p <= one.high:
+                continue
+            assert one.design.controller is not None
+            judged = judge_loops(plants, one.design.controller, coded, bounds, sampling,
+                                 one.design.bandwidth, integrator)  # fmt: skip
+            loop = closed_loop(sampled(plants[0], sampling.period, sampling.delay), coded)
+            bandwidth = min(bandwidth, loop_figures(loop, bounds.places).bandwidth)
+            passed &= bool(judged.passed)
+        found.append(FrozenPosition(p, passed, float(bandwidth)))
+    return found
+
+
+def entry(found: Schedule) -> dict[str, Any]:
+    """The content of schedule.json: Hz where the name says so, else SI."""
+    kept = sum(one.passed for one in found.frozen)
+    return json_values({
+        "status": "verified" if found.verified else "not_verified",
+        "parameter": found.name, "unit": found.unit,
+        "bandwidth_hz_of_one_controller": found.whole / HZ,
+        "parts": [
+            {"low": one.low, "high": one.high, "bandwidth_hz": one.design.bandwidth / HZ,
+             "passed": one.passed, "judge": one.judgement.entry, "proof": proof_dict(one.proof),
+             "controller": sections_controller(one.design, structured_of(one.problem).sampling)}
+            for one in found.segments
+        ],
+        "alone": [{"at": one.at, "bandwidth_hz": one.bandwidth / HZ} for one in found.alone],
+        "least_share_of_alone": found.least_share,
+        "positions": len(found.frozen), "positions_kept": kept,
+        "least_bandwidth_hz": min(one.bandwidth for one in found.frozen) / HZ,
+        "proven_parts": found.proven,
+        "rates": [vars(one) for one in found.rates], "allowed_rate": found.allowed,
+    })  # fmt: skip
+
+
+def summary(found: Schedule) -> list[str]:
+    """The lines that the command prints."""
+    kept = sum(one.passed for one in found.frozen)
+    unit = f" {found.unit}".rstrip()
+    rows = [
+        ("one", f"controller for all of {found.name}: {found.whole / HZ:.4g} Hz"),
+        *(("part", f"{found.name} = {one.low:.4g} to {one.high:.4g}{unit}: "
+           f"{one.design.bandwidth / HZ:.4g} Hz, {one.proof.words}") for one in found.segments),
+        *(("alone", f"at {one.at:.4g}{unit}: {one.bandwidth / HZ:.4g} Hz") for one in found.alone),
+        ("share", f"at least {100.0 * found.least_share:.3g} % of what a position has alone"),
+        ("judged", f"{kept} of {counted(len(found.frozen), 'position')} keep every bound"),
+        ("proven", f"{found.proven} of {counted(len(found.segments), 'part')}"),
+        ("rate", f"up to {found.allowed:.3g}{unit}/s: the largest motion rises by "
+         f"{100.0 * (RateOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
+         if found.allowed else "none of the simulated rates keeps the loop quiet"),
+    ]  # fmt: skip
+    return [f"{name:14s}{words}" for name, words in rows]
+
+
+def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
+    """Write schedule.h and schedule.c.
+
+    Parameters
+    ----------
+    folder : Path
+    found : Schedule
+    sampling : Sampling
+    """
+    K = controllers_of(found.segments, sampling)
+
+    def joined(parts: Sequence[Array]) -> str:
+        return literals(np.concatenate([part.ravel() for part in parts]), 4)
+
+    values: Mapping[str, Any] = {
+        "name": found.name, "unit": found.unit or "its unit", "parts": len(K),
+        "status": "verified" if found.verified else "NOT verified",
+        "period": literal(sampling.period), "rate": f"{sampling.rate_hz:.10g}",
+        "delay": f"{sampling.delay:.10g}", "allowed": f"{found.allowed:.3g}",
+        "n": len(K[0].A), "p": K[0].B.shape[1], "m": len(K[0].C),
+        "low": literals(np.array([one.low for one in found.segments]), 4),
+        "high": literals(np.array([one.high for one in found.segments]), 4),
+        **{part: joined([getattr(one, part) for one in K]) for part in "ABCD"},
+        "X": joined([takeover(one) for one in K]),
+    }  # fmt: skip
+    for name in CODE:
+        text = template(f"extensions/schedule/templates/{name}").render(values)
+        (folder / name).write_text(text, "utf-8")

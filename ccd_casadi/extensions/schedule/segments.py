@@ -1,0 +1,268 @@
+"""Parts of a stroke, each with its own controller of the same sections.
+
+A case with a parameter p that `varies` has one controller for all of [p_low, p_high]. Here the
+range is halved where that costs more than a share of the bandwidth that a position has alone:
+
+    [p_low, p_high] -> [p_low, m + d], [m - d, p_high],    m the middle, d a share of the width
+
+Parts overlap by 2 d, in which either controller is proven: the handover has a hysteresis, and lies
+where both are valid. A part's search also begins at the controller of what it was halved from,
+which keeps every bound on it: no part is slower than what it comes from.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
+from ccd_casadi.inner_problem.structured_search import prepared, with_range
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.terminal import Tell, silent
+
+
+@dataclass(frozen=True)
+class ScheduleOptions:
+    """Numbers of a schedule.
+
+    Attributes
+    ----------
+    share : float
+        Of the bandwidth that a position has alone, which its part has at least.
+    most : int
+        Parts at most.
+    overlap : float
+        d, over the width of the part that is halved.
+    positions : int
+        At which a controller for that position alone is searched, evenly over the range.
+    """
+
+    share: float = 0.9
+    most: int = 8
+    overlap: float = 0.05
+    positions: int = 5
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A part of the range and its controller.
+
+    Attributes
+    ----------
+    low, high : float
+        Of p, SI.
+    problem : CoDesignProblem
+        With p in [low, high], and with what the search found.
+    design : SectionsDesign
+    judgement : Judgement
+        On plants of the part.
+    proof : Proof
+        On all of the part.
+    """
+
+    low: float
+    high: float
+    problem: CoDesignProblem
+    design: SectionsDesign
+    judgement: Judgement
+    proof: Proof
+
+    @property
+    def passed(self) -> bool:
+        """Judged well and not refuted."""
+        return bool(self.judgement.passed) and not self.proof.refuted
+
+
+@dataclass(frozen=True)
+class Alone:
+    """A position by itself: ω_b of its own best controller, rad/s; 0: none was found."""
+
+    at: float
+    bandwidth: float
+
+
+def scheduled_name(problem: CoDesignProblem, name: str | None) -> str:
+    """The parameter that a schedule is over.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    name : str, optional
+        Left out, the only one that varies.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    UserError
+        None varies, or several do and none is named; or the controller is of another kind.
+    """
+    if not isinstance(problem.controller, StructuredProblem):
+        raise UserError('schedule: needs controller.structure = "sections"')
+    names = [own for own, *_ in structured_of(problem).uncertainty.ranges]
+    if not names:
+        raise UserError("schedule: no parameter varies; give one `varies = true`")
+    if name is None and len(names) > 1:
+        raise UserError(f"schedule: {', '.join(names)} vary; say which is measured, with --by NAME")
+    if name is not None and name not in names:
+        raise UserError(f"--by {name}: does not vary; known are {', '.join(names)}")
+    return name or names[0]
+
+
+def within(problem: CoDesignProblem, name: str, low: float, high: float) -> CoDesignProblem:
+    """The problem on a part of the range; with low = high that position alone."""
+    u, middle = structured_of(problem).uncertainty, 0.5 * (low + high)
+    ranges = tuple(
+        (own, low, high) if own == name else (own, least, most) for own, least, most in u.ranges
+        if own != name or low < high
+    )  # fmt: skip
+    fixed = tuple((own, middle if own == name else value, unit)
+                  for own, value, unit in problem.source.fixed)  # fmt: skip
+    found = replace(problem, source=replace(problem.source, fixed=fixed))
+    return with_structured(
+        found, uncertainty=replace(u, ranges=ranges), warm_starts=(), scenarios=()
+    )
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the range with the controller that was found for it."""
+
+    low: float
+    high: float
+    problem: CoDesignProblem
+    design: SectionsDesign
+
+
+Search = Callable[[float, float, SectionsDesign | None], Part]
+
+
+def designed(
+    problem: CoDesignProblem, theta: Sequence[float], warm: SectionsDesign | None = None,
+    tell: Tell = silent, workers: Pool | None = None,
+) -> tuple[CoDesignProblem, SectionsDesign]:  # fmt: skip
+    """The largest bandwidth on a part, from many starts, and from a controller that keeps it."""
+    own = replace(problem, start=tuple(theta))
+    if warm is not None:
+        own = with_structured(own, warm_starts=(tuple(map(float, warm.kappa)),))
+    own, made, _ = prepared(own, tell, workers)
+    if warm is not None and not made.bandwidth >= warm.bandwidth:
+        own, made = problem, warm  # which keeps every bound on the part, too
+    return own, made
+
+
+def segments_of(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, *,
+    workers: Pool, tell: Tell = silent,
+    options: ScheduleOptions = ScheduleOptions(),
+) -> tuple[list[Segment], list[Alone], float]:  # fmt: skip
+    """Halve the range until every part has its share of what its positions have alone.
+
+    Parameters
+    ----------
+    problem, theta, name : CoDesignProblem, sequence of float, str
+        The hardware, and the parameter that is measured.
+    workers, tell : Pool, callable
+    options : ScheduleOptions
+
+    Returns
+    -------
+    list of Segment
+        Ascending, each judged and, where it can be, proven.
+    list of Alone
+    float
+        ω_b of one controller for the whole range, rad/s.
+
+    Raises
+    ------
+    UserError
+        No controller keeps every bound on the whole range.
+    """
+    problem = with_range(replace(problem, start=tuple(theta)))  # one range of K for every part
+    low, high = next((a, b) for own, a, b in structured_of(problem).uncertainty.ranges
+                     if own == name)  # fmt: skip
+
+    def search(a: float, b: float, warm: SectionsDesign | None = None) -> Part:
+        return Part(a, b, *designed(within(problem, name, a, b), theta, warm, tell, workers))
+
+    alone = []
+    for i, at in enumerate(np.linspace(low, high, options.positions).tolist(), 1):
+        tell(f"position {i} of {options.positions} alone, {name} = {at:.4g}")
+        made = search(at, at).design
+        alone.append(Alone(at, made.bandwidth if made.certified else 0.0))
+    tell("one controller for the whole range")
+    whole = search(low, high)
+    if not whole.design.certified:
+        words = f"no controller for the whole range to begin with: {whole.design.words}"
+        raise UserError(f"schedule: {words}")
+    parts = halved(whole, alone, search, tell, options)
+    return _judged(parts, theta, tell, workers), alone, whole.design.bandwidth
+
+
+def halved(
+    whole: Part, alone: Sequence[Alone], search: Search, tell: Tell = silent,
+    options: ScheduleOptions = ScheduleOptions(),
+) -> list[Part]:  # fmt: skip
+    """Halve the part with the least share, until each has the required one, or there are enough.
+
+    Parameters
+    ----------
+    whole : Part
+    alone : sequence of Alone
+    search : callable
+        (low, high, a design that keeps every bound there) -> Part.
+    tell : callable
+    options : ScheduleOptions
+
+    Returns
+    -------
+    list of Part
+        Ascending.
+    """
+    parts = [whole]
+    while len(parts) < options.most:
+        slowest = min(parts, key=lambda part: share_of(part, alone))
+        if share_of(slowest, alone) >= options.share:
+            break
+        parts.remove(slowest)
+        a, b = slowest.low, slowest.high
+        middle, d = 0.5 * (a + b), options.overlap * (b - a)
+        for low, high in ((a, middle + d), (middle - d, b)):
+            share = 100.0 * share_of(slowest, alone)
+            tell(f"part {low:.4g} to {high:.4g}: {share:.3g} % of what its positions have alone")
+            parts.append(search(low, high, slowest.design))
+    return sorted(parts, key=lambda part: part.low)
+
+
+def share_of(part: Part, alone: Sequence[Alone]) -> float:
+    """The least ω_b over that of a position alone, of the positions in a part; of a part between
+    two of them, of these."""
+    inside = [one for one in alone if part.low <= one.at <= part.high]
+    if not inside:
+        middle = 0.5 * (part.low + part.high)
+        inside = sorted(alone, key=lambda one: abs(one.at - middle))[:2]
+    return min(part.design.bandwidth / one.bandwidth if one.bandwidth else np.inf
+               for one in inside)  # fmt: skip
+
+
+def _judged(
+    parts: Sequence[Part], theta: Sequence[float], tell: Tell, workers: Pool
+) -> list[Segment]:
+    found = []
+    for i, part in enumerate(parts, 1):
+        tell(f"judge and proof of part {i} of {len(parts)}")
+        on_box = DesignOnBox(part.problem, tuple(theta), part.design)
+        worst = on_box.worst(workers=workers)[0]
+        wide, checked, proof = on_box.judged(worst, workers)
+        judgement = judgement_of(wide, checked)
+        found.append(Segment(**vars(part), judgement=judgement, proof=proof))
+    return found
