@@ -22,8 +22,8 @@ GROUP = "ccd_casadi.extensions"  # the package here, and entry points of other d
 SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "commands": {
         "cross_check": "cross_check", "drive": "drives", "explore": "explorer",
-        "gap": "limitations", "imported": "imported", "record": "records", "tune": "measured",
-        "worth": "worth",
+        "gap": "limitations", "imported": "imported", "record": "records",
+        "tolerances": "tolerances", "tune": "measured", "worth": "worth",
     },
     "plants": {
         "cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",
