@@ -241,27 +241,24 @@ class RobustTable:
         "sections: options of other plants, in TOML files or tables", (), check=checks.plant_options
     )
     share: float | None = key(
-        "sections: the share of machines that keep every bound, for `ccd tolerances` alone; "
-        "absent: all of the box",
+        "sections: share of machines that keep every bound (`ccd tolerances`); absent: the box",
         None,
         check=checks.FRACTION,
     )
     confidence: float = key("sections: of that share", 0.99, check=checks.FRACTION)
     distribution: Mapping[str, str] | None = key(
-        "sections: of each tolerance by name where share is given, uniform or normal; absent: "
-        "uniform",
+        "sections: uniform or normal, by name of a tolerance, for share; absent: uniform",
         None,
         check=checks.by_name(checks.choice("uniform", "normal")),
     )
     cost_per_percent: Mapping[str, float] | None = key(
-        "sections: by name, what f rises by for each percent that a half-width is narrowed, for "
-        "`ccd tolerances` alone",
+        "sections: by name, what f rises by for each percent less of half-width "
+        "(`ccd tolerances`)",
         None,
         check=checks.by_name(checks.POSITIVE),
     )
     half_width: Mapping[str, Any] | None = key(
-        "sections: by name, least and largest half-width as shares where cost_per_percent is "
-        "given; absent: 0.25 to 2 times the case's",
+        "sections: by name, least and largest for cost_per_percent; absent: 0.25 to 2 times",
         None,
         check=checks.by_name(checks.interval),
     )

@@ -29,7 +29,6 @@ from ccd_casadi.support.terminal import silent
 from ccd_casadi.support.text import HZ, number
 
 SHARES = ("resonance_shift", "mode_shift", "gain")  # half-widths as shares
-HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def prices(
         known = [w for key, w in slopes.items() if tolerance_of(key) == name]
         found.append(Price(
             name, width_words(problem, name),
-            at(name, 0.0) - made.bandwidth, at(name, HALF) - made.bandwidth,
+            at(name, 0.0) - made.bandwidth, at(name, 0.5) - made.bandwidth,
             -sum(known) if known else np.nan,
         ))  # fmt: skip
     return made.bandwidth, tuple(found)

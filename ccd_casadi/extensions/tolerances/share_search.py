@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from ccd_casadi.codesign.outer import pieces_from
-from ccd_casadi.codesign.stored_searches import value_with_design
+from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.extensions.tolerances.machines import Machine, Plan, drawn
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
@@ -260,6 +260,11 @@ def search_share(
     """
     search = search.at_its_theta(tell, options)
     J = partial(objective_of, search.problem)
+    elsewhere = multistart_at(search.sampler, search.best)  # another controller may be better there
+    if J(elsewhere) < J(search.best) - options.settled * abs(J(search.best)):
+        best = search.sampler.value_from(search.best.theta, elsewhere.design.kappa.tolist())
+        other = replace(search, best=best).at_its_theta(tell, options)
+        search = min((search, other), key=lambda one: (not one.settled, J(one.best)))
     for _ in range(options.moves if moves else 0):
         if ends_early("move of theta"):
             break
