@@ -1,6 +1,7 @@
 """A share of machines, what tolerances cost, and half-widths as variables."""
 
 import json
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,22 +13,23 @@ import pytest
 import scipy
 from oracles.case_documents import QUICK_SECTIONS
 
-from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case import load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.extensions.tolerances import widths
+from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.extensions.tolerances import answers, widths
 from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, drawn
 from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
-from ccd_casadi.extensions.tolerances.prices import prices, scaled
+from ccd_casadi.extensions.tolerances.prices import scaled
 from ccd_casadi.extensions.tolerances.share_certificate import (
     ShareCertificate,
     certified_share,
     judged,
 )
-from ccd_casadi.extensions.tolerances.widths import Bought, promised
+from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, promised
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.terminal import silent
+from ccd_casadi.support.text import HZ
 from ccd_casadi.tolerances import main
 
 ROBUST = """[robust]
@@ -171,6 +173,10 @@ def test_the_line_names_share_confidence_and_draws_and_claims_no_box(failed: int
         ("share = 0.9\ncost_per_percent = {gain = 1.0}", "cost_per_percent: is of the whole box"),
         ("cost_per_percent = {damping = 1.0}", "cost_per_percent.damping: has no such"),
         ("half_width = {gain = [0.01, 0.1]}", "half_width: has no effect without cost_per_percent"),
+        (
+            "cost_per_percent = {gain = 1.0}\nhalf_width = {gain = [0.03, 0.1]}",
+            "half_width.gain: is 0.03 to 0.1, without the case's own 0.02",
+        ),
         ("share = 1.0", "robust.share"),
     ],
 )
@@ -180,7 +186,7 @@ def test_keys_without_effect_are_refused(tmp_path: Path, robust: str, words: str
 
 
 def test_what_cannot_keep_a_share_refuses_it_by_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, two_mass_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = case_file(tmp_path, f"{ROBUST}share = 0.9\n")
     with pytest.raises(UserError, match=r"robust\.share: is kept by `ccd tolerances` alone"):
@@ -192,6 +198,8 @@ def test_what_cannot_keep_a_share_refuses_it_by_name(
     for robust, words in ((ROBUST, "robust.share: is missing"), ("", "has no tolerance")):
         assert main([str(case_file(tmp_path, robust)), "--quiet"]) == 2
         assert words in capsys.readouterr().err
+    assert main([str(two_mass_run), "--quiet"]) == 2  # of full order
+    assert "tolerances are of controller.structure" in capsys.readouterr().err
 
 
 # ---- prices --------------------------------------------------------------------------------------
@@ -210,15 +218,32 @@ def test_scaled_widths_keep_the_model(tmp_path: Path) -> None:
         assert (np.clip(half.box, *whole.box) == half.box).all()
 
 
-def test_prices_fall_with_the_width(tmp_path: Path) -> None:
+def test_prices_fall_with_the_width_and_bought_widths_are_a_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The whole tolerance costs at least what half of it buys, and the slope has the same sign."""
-    problem = problem_of(load_case(case_file(tmp_path, "[robust]\ngain = 0.04\n")))
-    found, design, _ = prepared(problem)
-    bandwidth, (price,) = prices(found, found.start, design.kappa, None, silent)
-    assert bandwidth == pytest.approx(design.bandwidth, rel=1e-4)
-    assert price.cost >= price.half_buys > 0.0
-    assert price.slope > 0.0
-    assert "gain ±4 %" in price.words
+    robust = "[robust]\ngain = 0.04\ncost_per_percent = {gain = 0.1}\n"
+    case = load_case(case_file(tmp_path, robust))
+    found, design, _ = prepared(problem_of(case))
+    end = Bought({"gain": 0.05}, (58.5, 59.5), design.kappa, 1.0, 1.0, {})
+    made = WidthSearch(end, end, 1, np.nan)
+    monkeypatch.setattr(answers, "buy", lambda *_: made)
+    run: Any = SimpleNamespace(problem=found, theta=found.start, kappa=design.kappa, case=case)
+    answer = answers.price_answer(run, SimpleNamespace(workers=None), quiet=True)  # type: ignore[arg-type]
+    (price,) = answer.entry["prices"]
+    assert answer.entry["bandwidth_hz"] == pytest.approx(design.bandwidth / HZ, rel=1e-4)
+    assert price["costs_hz"] >= price["half_buys_hz"] > 0.0
+    assert price["slope_hz"] > 0.0
+    assert any("gain ±4 %" in line for line in answer.words)
+    bought = parse_case(tomllib.loads(answer.files["tolerances_bought.toml"]), case.path)
+    assert bought.robust == replace(case.robust, gain=0.05, cost_per_percent=None)
+    assert [one.start for one in bought.theta] == list(end.theta)
+
+
+def test_a_case_of_tolerances_is_written_as_it_was_read(tmp_path: Path) -> None:
+    robust = 'share = 0.9\ndistribution = {gain = "normal", damping = "uniform"}\n'
+    case = load_case(case_file(tmp_path, f"{ROBUST}{robust}"))
+    assert parse_case(tomllib.loads(case_to_toml(case)), case.path) == case
 
 
 # ---- half-widths as variables --------------------------------------------------------------------
@@ -268,7 +293,7 @@ def test_a_share_has_more_bandwidth_than_the_whole_box(
 ) -> None:
     robust = "[robust]\ngain = 0.04\nshare = 0.9\nconfidence = 0.9\n"
     robust += 'distribution = {gain = "normal"}\n'
-    path, words = case_file(tmp_path, robust), ["--theta", "m1=59,m2=59", "--quiet"]
+    path, words = case_file(tmp_path, robust), ["--theta", "m1=59,m2=59"]
     assert main([str(path), *words]) == 0
     found = json.loads((tmp_path / "case_tolerances" / "tolerances.json").read_text())
     line = found["verdict"]["share"]

@@ -77,6 +77,11 @@ def tolerances_of_case(case: Case) -> Tolerances:
     of_cost = [name for name in SHARES if name in known]
     _require_known("cost_per_percent", table.cost_per_percent or (), of_cost, fail)
     _require_known("half_width", table.half_width or (), table.cost_per_percent or (), fail)
+    for name, (low, high) in (table.half_width or {}).items():
+        own = getattr(table, name)
+        if not low <= own <= high:
+            words = f"is {low:g} to {high:g}, without the case's own {own:g}; widen it"
+            raise fail(f"half_width.{name}", words)
     plan = None if table.share is None else Plan(table.share, table.confidence)
     return Tolerances(case, problem, plan, table.distribution or {})
 

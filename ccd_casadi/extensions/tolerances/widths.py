@@ -173,7 +173,7 @@ def buy(
     def J(u: Array) -> tuple[float, Array]:
         nonlocal best, count
         widths = dict(zip(costs, np.exp(u).tolist(), strict=True))
-        found = first if widths == case else at(widths, near=best)
+        found = first if np.array_equal(u, start_at) else at(widths, near=best)
         if found is None:  # worse than all: a line search turns back
             return 2.0 * abs(first.objective) + first.objective, np.zeros(len(u))
         if found is not first:
@@ -182,9 +182,9 @@ def buy(
         best = min(best, found, key=lambda one: one.objective)
         return found.objective, np.array([found.slopes.get(name, 0.0) for name in costs])
 
-    u = np.clip(np.log([case[name] for name in costs]), *bounds.T)
+    start_at = np.log([case[name] for name in costs])
     limits = {"maxfun": options.evaluations, "ftol": options.settled}
-    minimize(J, u, jac=True, bounds=bounds, method="L-BFGS-B", options=limits)
+    minimize(J, start_at, jac=True, bounds=bounds, method="L-BFGS-B", options=limits)
     return WidthSearch(best, first, count, promised(best, costs, bounds))
 
 
