@@ -252,8 +252,7 @@ class RobustTable:
         check=checks.by_name(checks.choice("uniform", "normal")),
     )
     cost_per_percent: Mapping[str, float] | None = key(
-        "sections: by name, what f rises by for each percent less of half-width "
-        "(`ccd tolerances`)",
+        "sections: by name, what f rises by for each percent less of half-width (`ccd tolerances`)",
         None,
         check=checks.by_name(checks.POSITIVE),
     )

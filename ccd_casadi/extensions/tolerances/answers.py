@@ -108,10 +108,9 @@ def design_for_share(
         verified = within(minutes, sampler, formulation, seed).verified
         if verified is not None and verified.certified:
             problem, whole, at = verified.problem, verified.design, verified.theta
-    start = with_structured(problem, scenarios=())
     kappa = None if whole is None else whole.kappa
     with within_budget(minutes):
-        first = begun(sampler.of(start), at, kappa, of.plan, of.distribution, seed, tell)
+        first = begun(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, tell)
         found = search_share(first, tell, moves=theta is None)
     design = recertified(found.problem, found.best.theta, found.design)
     on_box = DesignOnBox(found.problem, found.best.theta, design)

@@ -177,9 +177,11 @@ class ShareSearch:
             raise NoDesign(f"no controller was found for this share: {best.shortfall}")
         return replace(self, sampler=sampler, best=best)
 
-    def at_its_theta(self, tell: Tell, options: ShareOptions) -> "ShareSearch":
+    def at_its_theta(
+        self, tell: Tell, options: ShareOptions, beaten: float = np.inf
+    ) -> "ShareSearch":
         """Rounds of draws and designs at one θ, until a round shows no more failing machines than
-        are given up."""
+        are given up, or J is above that of a design which is `beaten`: it only rises."""
         search = replace(self, settled=False)
         for _ in range(options.rounds):
             search, failing = search.with_draws(options)
@@ -189,6 +191,8 @@ class ShareSearch:
             if ends_early("round of drawn machines"):
                 break
             search = search.redesigned(tell, options)
+            if objective_of(search.problem, search.best) > beaten:
+                break
         return search
 
 
@@ -230,12 +234,12 @@ def begun(
                                   frequencies=own.frequencies)  # fmt: skip
     options = range(1 + len(structured_of(problem).uncertainty.options))
     model = uncertain_plant(problem, theta).nominal
-    own_sampler = sampler.of(problem)
+    models = tuple(scenario_of((option, model)) for option in options)
+    own_sampler = sampler.of(with_structured(problem, scenarios=models))
     start = own_sampler.value_from(theta, kappa.tolist())
-    first = ShareSearch(own_sampler, start, plan, distribution, seed)
-    return replace(first, best=replace(start, kappa=tuple(map(float, kappa)))).on(
-        tuple(scenario_of((option, model)) for option in options)
-    )
+    if not start.feasible:
+        raise NoDesign(f"no controller was found for the model alone: {start.shortfall}")
+    return ShareSearch(own_sampler, start, plan, distribution, seed)
 
 
 def search_share(
@@ -263,7 +267,7 @@ def search_share(
     elsewhere = multistart_at(search.sampler, search.best)  # another controller may be better there
     if J(elsewhere) < J(search.best) - options.settled * abs(J(search.best)):
         best = search.sampler.value_from(search.best.theta, elsewhere.design.kappa.tolist())
-        other = replace(search, best=best).at_its_theta(tell, options)
+        other = replace(search, best=best).at_its_theta(tell, options, J(search.best))
         search = min((search, other), key=lambda one: (not one.settled, J(one.best)))
     for _ in range(options.moves if moves else 0):
         if ends_early("move of theta"):
@@ -272,7 +276,7 @@ def search_share(
         before = J(search.best)
         if not J(moved) < before - options.settled * abs(before):
             break
-        other = replace(search, best=moved).at_its_theta(tell, options)
+        other = replace(search, best=moved).at_its_theta(tell, options, before)
         better = J(other.best) < before - options.settled * abs(before)
         if not (better and other.settled >= search.settled):
             break

@@ -7,14 +7,16 @@ L-BFGS-B over ln t, with few evaluations: each moves θ from the best before, an
 
     ∂J/∂ln t_i = -100 w1 c_i t_i + w2 ∂ω_b*/∂ln t_i
 
-by the multipliers (the envelope theorem: θ and controller are optimal). What the slopes promise up
-to the bounds is the gap of a convex J; J need not be convex, and the local optima over θ are not
-searched anew.
+by the multipliers (the envelope theorem: θ and controller are optimal). ω_b* is often almost linear
+in t, and the optimum then at a corner of the bounds, of which few are evaluated too. What the
+slopes promise up to the bounds is the gap of a convex J; J need not be convex, and the local optima
+over θ are not searched anew.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -37,7 +39,9 @@ class WidthOptions:
     Attributes
     ----------
     evaluations : int
-        At most.
+        At most, before the corners.
+    corners : int
+        Of the bounds, that are evaluated where there are no more.
     settled : float
         Relative change of J that ends it.
     polish : float
@@ -47,6 +51,7 @@ class WidthOptions:
     """
 
     evaluations: int = 15
+    corners: int = 8
     settled: float = 1e-4
     polish: float = 1e-5
     usual: tuple[float, float] = (0.25, 2.0)
@@ -185,6 +190,9 @@ def buy(
     start_at = np.log([case[name] for name in costs])
     limits = {"maxfun": options.evaluations, "ftol": options.settled}
     minimize(J, start_at, jac=True, bounds=bounds, method="L-BFGS-B", options=limits)
+    if 2 ** len(bounds) <= options.corners:
+        for corner in product(*bounds.tolist()):
+            J(np.array(corner))
     return WidthSearch(best, first, count, promised(best, costs, bounds))
 
 
