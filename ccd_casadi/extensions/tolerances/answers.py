@@ -148,7 +148,7 @@ def share_answer(found: ShareDesign) -> Answer:
                "hardware_cost": hardware_cost(plant_of(problem), found.whole_theta)}  # fmt: skip
         gain = 100.0 * (design.bandwidth / whole.bandwidth - 1.0)
         figures = _figures_words(problem, found.whole_theta, whole)
-        words.append(f"whole box     {figures}; the share has {gain:+z.1f} % more bandwidth")
+        words.append(f"whole box     {figures}; the share has {gain:+z.1f} % of bandwidth")
     else:
         words.append("whole box     no controller was found for it")
     scenarios = structured_of(problem).scenarios
@@ -223,7 +223,7 @@ def _figures_words(
     problem: CoDesignProblem, theta: tuple[float, ...], design: SectionsDesign
 ) -> str:
     cost = hardware_cost(plant_of(problem), theta)
-    return f"{number(design.bandwidth / HZ)} Hz, f = {number(cost)} {problem.cost_unit}"
+    return f"{number(design.bandwidth / HZ)} Hz, f = {number(cost)} {problem.cost_unit}".rstrip()
 
 
 def _widths_words(one: Bought) -> str:

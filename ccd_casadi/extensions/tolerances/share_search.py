@@ -5,9 +5,9 @@
 by constraint removal with re-ranking (Campi and Garatti 2011): on a working set of draws the
 design is that of the core, with its exact slopes; all draws are then ranked by their largest figure
 over its bound; the K worst are given up, and those after them that exceed a bound join the set.
-Every round draws anew, until a round that no design has seen shows no more than K in all. q is
-smaller than the share that may fail, so that the certificate confirms it reliably
-(`machines.Plan`).
+Every round draws anew, until two rounds one after the other that no design has seen show no more
+than K in all: one alone is passed by luck too often. q is smaller than the share that may fail, so
+that the certificate confirms it reliably (`machines.Plan`).
 """
 
 from collections.abc import Mapping
@@ -49,6 +49,8 @@ class ShareOptions:
     ----------
     rounds : int
         Of new draws at one θ, at most.
+    confirming : int
+        Of these, one after the other without a new design, that end it.
     designs : int
         Between two rounds, at most.
     tail : int
@@ -63,7 +65,8 @@ class ShareOptions:
         Beside the run's: no other draw is repeated.
     """
 
-    rounds: int = 8
+    rounds: int = 12
+    confirming: int = 2
     designs: int = 12
     tail: int = 400
     added: int = 4
@@ -91,7 +94,7 @@ class ShareSearch:
     rounds : int
         Of new draws.
     settled : bool
-        Whether the last round showed no more failing machines than are given up.
+        Whether the last rounds showed no more failing machines than are given up.
     """
 
     sampler: Sampler
@@ -180,14 +183,17 @@ class ShareSearch:
     def at_its_theta(
         self, tell: Tell, options: ShareOptions, beaten: float = np.inf
     ) -> "ShareSearch":
-        """Rounds of draws and designs at one θ, until a round shows no more failing machines than
+        """Rounds of draws and designs at one θ, until rounds show no more failing machines than
         are given up, or J is above that of a design which is `beaten`: it only rises."""
-        search = replace(self, settled=False)
+        search, confirmed = replace(self, settled=False), 0
         for _ in range(options.rounds):
             search, failing = search.with_draws(options)
             tell(f"{failing} of {search.seen} drawn machines fail, {search.may_fail} may")
-            if failing <= search.may_fail:
+            confirmed = confirmed + 1 if failing <= search.may_fail else 0
+            if confirmed == options.confirming:
                 return replace(search, settled=True)
+            if confirmed:
+                continue
             if ends_early("round of drawn machines"):
                 break
             search = search.redesigned(tell, options)
