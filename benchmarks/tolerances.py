@@ -12,8 +12,8 @@ after one confirming round the share had 68.45 Hz (+5.6 %)
 and 3 of its 13,809 fresh draws failed, but in five more counts 1, 2, 6, 4 and 1 (5 may): four of
 five agree, 2.0e-4 of all machines fail. So two rounds have to confirm it. Of 777 toys below 99.9 %
 2 were claimed (at 99 % confidence 8 may be), of 14 that are to be confirmed all were. Prices
-agree with many starts to 1.2 %, but for half of the rib stage's shift (3.26 Hz, many starts 2.86) and
-of that of two encoders (2.27 and 1.70), where the list has found better designs. By multipliers
+agree with many starts to 1.2 %, but for half of the rib stage's shift (3.26 Hz, many starts 2.86)
+and of that of two encoders (2.27 and 1.70), where the list has found better designs. By multipliers
 they are off by 1 to 10 %, of damping by 20 to 30 %. With the shipped ±2 % of each mode and damping
 alone (74.32 Hz, the model 79.91 Hz) the share gains 0.8 %: one tolerance dominates, and its
 quantile is near the end of its range.
