@@ -10,7 +10,8 @@
 Measured, five tolerances at 3 sigma: the model alone about 80 Hz, the whole box 64.84 Hz; ended
 after one confirming round the share had 68.45 Hz (+5.6 %)
 and 3 of its 13,809 fresh draws failed, but in five more counts 1, 2, 6, 4 and 1 (5 may): four of
-five agree, 2.0e-4 of all machines fail. So two rounds have to confirm it. Of 777 toys below 99.9 %
+five agree, 2.0e-4 of all machines fail. So two rounds have to confirm it: then 68.40 Hz (+5.5 %),
+whose counts have not been measured; its last round showed 3 new failures. Of 777 toys below 99.9 %
 2 were claimed (at 99 % confidence 8 may be), of 14 that are to be confirmed all were. Prices
 agree with many starts to 1.2 %, but for half of the rib stage's shift (3.26 Hz, many starts 2.86)
 and of that of two encoders (2.27 and 1.70), where the list has found better designs. By multipliers
