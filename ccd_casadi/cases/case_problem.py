@@ -68,6 +68,9 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     if case.drive.name is not None:
         words = "is designed by `ccd drive` alone; use that, or drop [drive] for free sections"
         raise CaseError(f"{case.path}: drive: {words}")
+    if case.robust.share is not None:
+        words = "is kept by `ccd tolerances` alone; use that, or drop share for the whole box"
+        raise CaseError(f"{case.path}: robust.share: {words}")
     file = function = given = None
     if callable(case.plant.function):
         function, given = case.plant.name, GivenFunction(case.plant.function)

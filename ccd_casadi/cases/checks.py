@@ -236,6 +236,27 @@ names_of_theta = every(named, "give a list of names of [theta] in quotes")
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
+def by_name(item: Check) -> Check:
+    """Make the check of a table whose values all pass a check.
+
+    Parameters
+    ----------
+    item : Check
+
+    Returns
+    -------
+    Check
+    """
+
+    def check(value: Any) -> str | None:
+        if not isinstance(value, Mapping) or not value:
+            return f"is {short_repr(value)}; give a table of values by name"
+        wrong = ((name, item(each)) for name, each in value.items())
+        return next((f"{name} {words}" for name, words in wrong if words is not None), None)
+
+    return Check(check, {"type": "object", "additionalProperties": dict(item.schema)})
+
+
 def rows(width: int) -> Check:
     """Make the check of a list of rows of numbers.
 

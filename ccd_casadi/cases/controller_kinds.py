@@ -44,7 +44,16 @@ WITH_DISTURBANCE = "h_infinity_disturbance"
 _OF_STRUCTURED = {
     "controller": tuple(f.name for f in fields(ControllerTable) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
-    "robust": ("mode_shift", "gain", "plants"),
+    "robust": (
+        "mode_shift",
+        "gain",
+        "plants",
+        "share",
+        "confidence",
+        "distribution",
+        "cost_per_percent",
+        "half_width",
+    ),
     "inner": ("shape", "shape_ends", "minimise", "bandwidth_least_hz"),
 }
 # What [controller.channel.NAME] bounds besides the whole loop.

@@ -235,6 +235,27 @@ class RobustTable:
     plants: tuple[Any, ...] = key(
         "sections: options of other plants, in TOML files or tables", (), check=checks.plant_options
     )
+    share: float | None = key(
+        "sections: share of machines that keep every bound (`ccd tolerances`); absent: the box",
+        None,
+        check=checks.FRACTION,
+    )
+    confidence: float = key("sections: of that share", 0.99, check=checks.FRACTION)
+    distribution: Mapping[str, str] | None = key(
+        "sections: uniform or normal, by name of a tolerance, for share; absent: uniform",
+        None,
+        check=checks.by_name(checks.choice("uniform", "normal")),
+    )
+    cost_per_percent: Mapping[str, float] | None = key(
+        "sections: by name, what f rises by for each percent less of half-width (`ccd tolerances`)",
+        None,
+        check=checks.by_name(checks.POSITIVE),
+    )
+    half_width: Mapping[str, Any] | None = key(
+        "sections: by name, least and largest for cost_per_percent; absent: 0.25 to 2 times",
+        None,
+        check=checks.by_name(checks.interval),
+    )
 
 
 @dataclass(frozen=True)

@@ -191,17 +191,20 @@ class DesignOnBox:
         Options are equally likely. None where there is no box.
         """
         structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
-        loose = options.looseness
         if not uncertain.names or self.design.controller is None:
             return None
         count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
         rng = np.random.default_rng((structured.seed, options.fresh_seed))
-        points = uncertain.drawn(rng, count)
-        plants = uncertain.as_written(points)
+        return Yield(sum(self.kept(uncertain.drawn(rng, count), workers)), count)
+
+    def kept(self, points: Sequence[tuple[int, Array]], workers: Pool | None = None) -> list[bool]:
+        """Which plants (option, point) keep every bound and ω_b, by the judge, to `looseness`."""
+        assert self.design.controller is not None
+        plants, loose = self.uncertain.as_written(points), self.options.looseness
         found = _judged(self.problem, plants, self.design.controller, loose, workers).plants
         bounds = bounds_of(self.problem).looser(loose)
         least = self.design.bandwidth * (1.0 - loose)
-        kept = [
+        return [
             one.stable and one.confirmed and one.bandwidth >= least
             and all(
                 share <= 1.0 + JudgeOptions.tolerance
@@ -209,7 +212,6 @@ class DesignOnBox:
             )
             for one in found
         ]  # fmt: skip
-        return Yield(sum(kept), count)
 
     def proof(self, workers: Pool | None = None) -> "Proof":
         """Branch and bound over the whole box."""

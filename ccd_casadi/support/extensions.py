@@ -23,7 +23,8 @@ SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
     "commands": {
         "cross_check": "cross_check", "drive": "drives", "explore": "explorer",
         "feedforward": "feedforward", "gap": "limitations", "imported": "imported",
-        "record": "records", "schedule": "schedule", "tune": "measured", "worth": "worth",
+        "record": "records", "schedule": "schedule", "tolerances": "tolerances",
+        "tune": "measured", "worth": "worth",
     },
     "plants": {
         "cad_stage": "cad", "modal_table": "imported", "rib_stage": "rib_stage",

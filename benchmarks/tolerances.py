@@ -1,0 +1,163 @@
+"""Tolerances: what a share of machines gains, how often fresh draws agree, what prices are worth.
+
+    python benchmarks/tolerances.py share       the rib stage's z channel at 99.9 %, 20 repetitions
+    python benchmarks/tolerances.py coverage    1,000 toys whose share is known
+    python benchmarks/tolerances.py prices      price lists against searches with many starts
+    python benchmarks/tolerances.py widths      half-widths, machine and controller of case study 1
+
+`share` takes half an hour on one core, `prices` and `widths` some minutes each.
+
+Measured, five tolerances at 3 sigma: the model alone about 80 Hz, the whole box 64.84 Hz; ended
+after one confirming round the share had 68.45 Hz (+5.6 %)
+and 3 of its 13,809 fresh draws failed, but in five more counts 1, 2, 6, 4 and 1 (5 may): four of
+five agree, 2.0e-4 of all machines fail. So two rounds have to confirm it: then 68.40 Hz (+5.5 %),
+whose counts have not been measured; its last round showed 3 new failures. Of 777 toys below 99.9 %
+2 were claimed (at 99 % confidence 8 may be), of 14 that are to be confirmed all were. Prices
+agree with many starts to 1.2 %, but for half of the rib stage's shift (3.26 Hz, many starts 2.86)
+and of that of two encoders (2.27 and 1.70), where the list has found better designs. By multipliers
+they are off by 1 to 10 %, of damping by 20 to 30 %. With the shipped ±2 % of each mode and damping
+alone (74.32 Hz, the model 79.91 Hz) the share gains 0.8 %: one tolerance dominates, and its
+quantile is near the end of its range.
+"""
+
+import sys
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.tables import Case
+from ccd_casadi.extensions.tolerances.answers import design_for_share, share_answer
+from ccd_casadi.extensions.tolerances.machines import Plan, drawn
+from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
+from ccd_casadi.extensions.tolerances.prices import prices, scaled
+from ccd_casadi.extensions.tolerances.share_certificate import certified_share
+from ccd_casadi.extensions.tolerances.widths import buy
+from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.text import HZ
+
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = ("resonance_shift", "mode_shift", "damping", "gain")
+WIDE = {"resonance_shift": 0.04, "mode_shift": 0.02, "damping": [0.5, 2.0], "gain": 0.06}
+
+
+def rib_stage_z(**robust: Any) -> Case:
+    """The vertical channel of the shipped rib stage, only its rib height free."""
+    path = ROOT / "runs" / "rib_stage_built.toml"
+    data = tomllib.loads(path.read_text())
+    data["plant"]["outputs"] = "z"
+    for name, table in data["theta"].items():
+        if name != "H":
+            data["theta"][name] = {"fixed": table["start"], "unit": "m"}
+    del data["controller"]["channel"]
+    data["controller"]["biquads"] = 3
+    data["robust"] = robust
+    return parse_case(data, path)
+
+
+def with_sampler(case: Case, body: Callable[[Sampler], None], *, quiet: bool = True) -> None:
+    """Call with a sampler of the whole box's problem, in this process."""
+    of = tolerances_of_case(case)
+    with Workers(1) as workers, SampleStore(":memory:") as store:
+        body(Sampler(of.problem, store, workers, quiet=quiet))
+
+
+def share() -> None:
+    """Design for 99.9 %, then 20 counts of fresh draws by the engine of the search."""
+    case = rib_stage_z(**WIDE, share=0.999, distribution=dict.fromkeys(NAMES, "normal"))
+    of = tolerances_of_case(case)
+
+    def body(sampler: Sampler) -> None:
+        found = design_for_share(of, sampler, of.problem.start, 0, 120.0)
+        print("\n".join(share_answer(found).words), flush=True)
+        search, counts = found.search, []
+        uncertain = uncertain_plant(search.problem, search.best.theta)
+        for number in range(20):
+            rng = np.random.default_rng((0, 6000, number))
+            machines = drawn(uncertain, of.distribution, rng, search.plan.draws)
+            value = search.excesses(machines)
+            counts.append(int((value > 2.0 * WorstPlantOptions.within).sum()))
+            print(number, counts[-1], flush=True)
+        agree = sum(count <= search.plan.allowed for count in counts)
+        print(f"{agree} of 20 agree; {sum(counts)} of {20 * search.plan.draws} fail")
+
+    with_sampler(case, body, quiet=False)
+
+
+def coverage(toys: int = 1000) -> None:
+    """Of machines with two uniform tolerances 1 - d²/8 have x + y <= 2 - d."""
+    case = rib_stage_z(resonance_shift=0.02, gain=0.02)
+    problem = problem_of(case)
+    uncertain = uncertain_plant(problem, problem.start)
+    plan, rng = Plan(0.999, 0.99), np.random.default_rng(0)
+    shares = 1.0 - np.append(np.full(toys // 2, 1.0001e-3), rng.uniform(0.0, 2e-3, toys // 2))
+    wrong, passed, right, good = 0, 0, 0, 0
+    for seed, true in enumerate(shares.tolist()):
+        most = 0.02 * (2.0 - np.sqrt(8.0 * (1.0 - true)))
+        box: Any = SimpleNamespace(
+            uncertain=uncertain,
+            kept=lambda machines, most=most: [point.sum() <= most for _, point in machines],
+        )
+        found = certified_share(box, plan, {}, seed).passed
+        passed += found
+        wrong += found and true < plan.share
+        good += true >= 1.0 - plan.given_up
+        right += found and true >= 1.0 - plan.given_up
+    too_low = int((shares < plan.share).sum())
+    print(f"{toys} toys, {too_low} below {plan.share}: {wrong} of these claimed ({passed} in all)")
+    print(f"of {good} that are above 1 - {plan.given_up:.2g}, {right} are confirmed")
+
+
+def price_lists() -> None:
+    """The list, by re-solves from the run's controller, and by multipliers, against many starts."""
+    cases = {
+        "case study 1": load_case(ROOT / "runs" / "two_mass_built.toml"),
+        "two encoders": load_case(ROOT / "examples" / "two_encoders" / "case.toml"),
+        "rib stage, z": rib_stage_z(**WIDE),
+    }
+    for label, case in cases.items():
+
+        def body(sampler: Sampler, label: str = label) -> None:
+            problem, design, _ = prepared(sampler.problem)
+            theta = problem.start
+            bandwidth, found = prices(problem, theta, design.kappa, None, lambda words: None)
+            print(f"{label}: {bandwidth / HZ:.3f} Hz", flush=True)
+            for price in found:
+                anew = [prepared(scaled(sampler.problem, price.name, factor))[1].bandwidth
+                        for factor in (0.0, 0.5)]  # fmt: skip
+                cost, buys = ((best - bandwidth) / HZ for best in anew)
+                own = price.entry
+                slope = own["slope_hz"]
+                print(f"  {price.words}; many starts {cost:.3f}, {buys:.3f} Hz; multipliers "
+                      f"{slope:.3f}, {0.5 * slope:.3f} Hz", flush=True)  # fmt: skip
+
+        with_sampler(case, body)
+
+
+def widths() -> None:
+    """Half-widths of case study 1 where a percent less costs 0.4 kg."""
+    case = load_case(ROOT / "runs" / "two_mass_built.toml")
+    case = replace(case, robust=replace(case.robust, cost_per_percent={"resonance_shift": 0.4}))
+
+    def body(sampler: Sampler) -> None:
+        problem, design, _ = prepared(sampler.problem)
+        own, cost = sampler.of(problem), case.robust.cost_per_percent
+        found = buy(own, problem.start, design.kappa, cost or {}, {}, print)
+        print(found)
+
+    with_sampler(case, body)
+
+
+if __name__ == "__main__":
+    {"share": share, "coverage": coverage, "prices": price_lists, "widths": widths}[sys.argv[1]]()

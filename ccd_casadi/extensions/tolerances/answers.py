@@ -1,0 +1,250 @@
+"""What `ccd tolerances` answers: a design for a share of machines, or the prices of a run."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.case import Case
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.codesign.formulations import formulation_of, usual_name
+from ccd_casadi.codesign.result_entries import design_dict, sections_controller
+from ccd_casadi.codesign.run import within
+from ccd_casadi.extensions.tolerances.of_case import Tolerances
+from ccd_casadi.extensions.tolerances.prices import prices
+from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
+from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, search_share
+from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
+from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.json_files import json_values
+from ccd_casadi.support.terminal import remark
+from ccd_casadi.support.text import HZ, number
+from ccd_casadi.support.time_budget import within_budget
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command ends with.
+
+    Attributes
+    ----------
+    entry : dict
+        Of tolerances.json.
+    words : tuple of str
+        Lines for the terminal.
+    good : bool
+        Whether what is required is shown.
+    files : dict
+        Content of further files by name: JSON values, or text.
+    """
+
+    entry: dict[str, Any]
+    words: tuple[str, ...]
+    good: bool
+    files: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ShareDesign:
+    """A design for a share of machines, judged.
+
+    Attributes
+    ----------
+    whole : SectionsDesign or None
+        For the whole box at `whole_theta`; None where there is none.
+    search : ShareSearch
+    design : SectionsDesign
+        Certified anew on its working set.
+    certificate : ShareCertificate
+    """
+
+    whole: SectionsDesign | None
+    whole_theta: tuple[float, ...]
+    search: ShareSearch
+    design: SectionsDesign
+    certificate: ShareCertificate
+
+
+def design_for_share(
+    of: Tolerances, sampler: Sampler, theta: tuple[float, ...] | None, seed: int, minutes: float
+) -> ShareDesign:
+    """The whole box first, from there the share, then fresh draws.
+
+    Parameters
+    ----------
+    of : Tolerances
+        With a plan.
+    sampler : Sampler
+        Of its problem.
+    theta : tuple of float or None
+        The machine, SI; None: it is searched.
+    seed, minutes : int, float
+        Of every draw; of each of the two searches.
+
+    Returns
+    -------
+    ShareDesign
+    """
+    assert of.plan is not None
+
+    def tell(words: str) -> None:
+        remark(f"share: {words}", sampler.quiet)
+
+    problem, whole, at = sampler.problem, None, theta or of.problem.start
+    if theta is not None:
+        fixed = with_structured(replace(problem, start=theta), seed=seed)
+        with within_budget(minutes):
+            problem, made, _ = prepared(fixed, tell, sampler.workers)
+        whole = made if made.certified else None
+    else:
+        formulation = formulation_of(of.case, usual_name(of.case, len(problem.names)))
+        verified = within(minutes, sampler, formulation, seed).verified
+        if verified is not None and verified.certified:
+            problem, whole, at = verified.problem, verified.design, verified.theta
+    kappa = None if whole is None else whole.kappa
+    with within_budget(minutes):
+        first = begun(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, tell)
+        found = search_share(first, tell, moves=theta is None)
+    design = recertified(found.problem, found.best.theta, found.design)
+    on_box = DesignOnBox(found.problem, found.best.theta, design)
+    judged = certified_share(on_box, of.plan, of.distribution, seed, sampler.workers)
+    return ShareDesign(whole, at, found, design, judged)
+
+
+def share_answer(found: ShareDesign) -> Answer:
+    """The verdict, the design, and what it gains over that for the whole box.
+
+    Parameters
+    ----------
+    found : ShareDesign
+
+    Returns
+    -------
+    Answer
+    """
+    search, design, whole = found.search, found.design, found.whole
+    problem, theta, line = search.problem, search.best.theta, found.certificate.line
+    good = found.certificate.passed and design.certified
+    at = ", ".join(f"{name} = {number(v)} {unit}" for name, v, unit in
+                   zip(problem.names, theta, problem.units, strict=True))  # fmt: skip
+    words = [f"share         {line.state.value}: {line.words}"]
+    words += [f"              {detail}" for detail in line.details]
+    words.append(f"design        {_figures_words(problem, theta, design)}; {at}")
+    if not design.certified:
+        words.insert(0, f"certified     failed: {design.words}")
+    if not search.settled:
+        words.append("search        ended before a round of draws confirmed it")
+    own: dict[str, Any] = {}
+    if whole is not None:
+        own = {"theta": dict(zip(problem.names, found.whole_theta, strict=True)),
+               "bandwidth_hz": whole.bandwidth / HZ,
+               "hardware_cost": hardware_cost(plant_of(problem), found.whole_theta)}  # fmt: skip
+        gain = 100.0 * (design.bandwidth / whole.bandwidth - 1.0)
+        figures = _figures_words(problem, found.whole_theta, whole)
+        words.append(f"whole box     {figures}; the share has {gain:+z.1f} % of bandwidth")
+    else:
+        words.append("whole box     no controller was found for it")
+    scenarios = structured_of(problem).scenarios
+    entry = {
+        "status": "verified" if good else "not_verified",
+        "verdict": {"share": line.entry},
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "hardware_cost": hardware_cost(plant_of(problem), theta),
+        **json_values(design_dict(problem, theta, design)),
+        "whole_box": own or None,
+        "search": {
+            "drawn": search.seen, "given_up": search.may_fail, "rounds": search.rounds,
+            "settled": search.settled,
+            "set": [{"option": option, "point": list(point)} for option, point in scenarios],
+        },
+    }  # fmt: skip
+    files = {} if design.controller is None else {
+        "controller.json": sections_controller(design, problem.sampling)
+    }  # fmt: skip
+    return Answer(entry, tuple(words), good, files)
+
+
+def price_answer(run: FinishedRun, sampler: Sampler, quiet: bool) -> Answer:
+    """The price list of a run; with `cost_per_percent` the half-widths that cost least.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        With sections.
+    sampler : Sampler
+        Of its problem.
+    quiet : bool
+
+    Returns
+    -------
+    Answer
+    """
+
+    def tell(words: str) -> None:
+        remark(f"prices: {words}", quiet)
+
+    assert run.kappa is not None
+    table = run.case.robust
+    bandwidth, found = prices(run.problem, run.theta, run.kappa, sampler.workers, tell)
+    entry: dict[str, Any] = {"bandwidth_hz": bandwidth / HZ, "prices": [p.entry for p in found]}
+    words = [f"design        {number(bandwidth / HZ)} Hz with all tolerances",
+             *(f"price         {price.words}" for price in found)]  # fmt: skip
+    if table.cost_per_percent is None:
+        return Answer(entry, tuple(words), True, {})
+
+    def tell_of(one: Bought) -> None:
+        tell(f"J = {number(one.objective, 7)} at {_widths_words(one)}")
+
+    best = buy(sampler, run.theta, run.kappa, table.cost_per_percent, table.half_width or {},
+               tell_of)  # fmt: skip
+    if best is None:
+        words.insert(0, "widths        the run's design was not found again")
+        return Answer(entry, tuple(words), False, {})
+    entry["widths"] = _widths_entry(run.problem, best)
+    name = "tolerances_bought.toml"
+    words += [
+        f"widths        {_widths_words(best.best)}: {number(best.best.bandwidth / HZ)} Hz, "
+        f"J = {number(best.best.objective, 7)} instead of {number(best.first.objective, 7)}",
+        f"              best of {best.evaluations}; the slopes promise at most "
+        f"{number(best.gap, 2)} more in J, where J is convex; solve {name} to verify it",
+    ]
+    bought = case_to_toml(_with_bought(run.case, best.best))
+    return Answer(entry, tuple(words), True, {name: bought})
+
+
+def _figures_words(
+    problem: CoDesignProblem, theta: tuple[float, ...], design: SectionsDesign
+) -> str:
+    cost = hardware_cost(plant_of(problem), theta)
+    return f"{number(design.bandwidth / HZ)} Hz, f = {number(cost)} {problem.cost_unit}".rstrip()
+
+
+def _widths_words(one: Bought) -> str:
+    return ", ".join(f"{name} ±{number(100.0 * t, 3)} %" for name, t in one.widths.items())
+
+
+def _widths_entry(problem: CoDesignProblem, found: WidthSearch) -> dict[str, Any]:
+    def of(one: Bought) -> dict[str, Any]:
+        return {"half_widths": dict(one.widths), "objective": one.objective,
+                "bandwidth_hz": one.bandwidth / HZ, "slopes": dict(one.slopes),
+                "theta": dict(zip(problem.names, one.theta, strict=True))}  # fmt: skip
+
+    gap = found.gap if np.isfinite(found.gap) else None
+    return {"best": of(found.best), "of_the_case": of(found.first), "gap_if_convex": gap,
+            "evaluations": found.evaluations}  # fmt: skip
+
+
+def _with_bought(case: Case, best: Bought) -> Case:
+    """The case with these half-widths, its start at the machine; without prices, which are of the
+    case's own half-widths."""
+    widths: dict[str, Any] = dict(best.widths)
+    bare = replace(case.robust, cost_per_percent=None, half_width=None, **widths)
+    theta = tuple(replace(one, start=v) for one, v in zip(case.theta, best.theta, strict=True))
+    return replace(case, robust=bare, theta=theta)

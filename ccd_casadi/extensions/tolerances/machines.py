@@ -1,0 +1,126 @@
+"""Machines drawn from the distributions of their tolerances, and what a count of them decides.
+
+A tolerance is "uniform" on its range, or "normal": each end of the range is `sigmas` standard
+deviations from the model, on that side, and what is beyond is cut off. So the median is the model's
+value wherever it lies in the range. The factor of damping is normal in its logarithm. Options of
+the plant are alike often. Single modes are drawn independently of each other.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import count
+from math import ceil, log, log1p
+
+import numpy as np
+from scipy.special import betaincinv, ndtr, ndtri
+
+from ccd_casadi.analysis.yield_bound import yield_bound
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.support.arrays import Array
+
+Machine = tuple[int, Array]  # option, point of the box
+
+
+@dataclass(frozen=True)
+class MachineOptions:
+    """Numbers of the draws.
+
+    Attributes
+    ----------
+    sigmas : float
+        Standard deviations from the model to an end of the range.
+    enough : float
+        Fresh draws, over the least number that shows the share where none fails.
+    reliable : float
+        Probability with which a design that the search accepts is to be confirmed.
+    """
+
+    sigmas: float = 3.0
+    enough: float = 3.0
+    reliable: float = 0.999
+
+
+def tolerance_of(name: str) -> str:
+    """The tolerance of an uncertain parameter: one for the shifts of all single modes."""
+    return name.split(" ")[0]
+
+
+def drawn(
+    uncertain: UncertainPlant,
+    distribution: Mapping[str, str],
+    rng: np.random.Generator,
+    number: int,
+    options: MachineOptions = MachineOptions(),
+) -> list[Machine]:
+    """Draw machines.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        The box, with n parameters.
+    distribution : mapping
+        "uniform" or "normal" by tolerance; uniform where it has none.
+    rng : Generator
+    number : int
+        Of machines.
+    options : MachineOptions
+
+    Returns
+    -------
+    list of (int, (n,) array)
+        Options and points of the box.
+    """
+    option = rng.integers(len(uncertain.options), size=number).tolist()
+    unit = rng.random((number, len(uncertain.names)))
+    points = np.empty_like(unit)
+    ends = zip(uncertain.names, *uncertain.box, uncertain.nominal, strict=True)
+    for k, (name, low, high, model) in enumerate(ends):
+        if distribution.get(tolerance_of(name), "uniform") == "uniform":
+            points[:, k] = low + unit[:, k] * (high - low)
+            continue
+        cut = ndtr(-options.sigmas)
+        z = ndtri(cut + unit[:, k] * (1.0 - 2.0 * cut)) / options.sigmas  # from -1 to 1
+        if name == "damping":
+            points[:, k] = model * np.where(z < 0.0, (low / model) ** -z, (high / model) ** z)
+        else:
+            points[:, k] = model + np.where(z < 0.0, z * (model - low), z * (high - model))
+    return list(zip(option, points, strict=True))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many draws decide on a share at a confidence, and what the search may give up for it.
+
+    Attributes
+    ----------
+    share, confidence : float
+    options : MachineOptions
+    """
+
+    share: float
+    confidence: float
+    options: MachineOptions = MachineOptions()
+
+    @cached_property
+    def draws(self) -> int:
+        """Fresh draws of the certificate."""
+        return ceil(self.options.enough * log1p(-self.confidence) / log(self.share))
+
+    def shown(self, failed: int) -> float:
+        """The least share of all machines where that many of the draws fail."""
+        return yield_bound(self.draws - failed, self.draws, self.confidence)
+
+    @cached_property
+    def allowed(self) -> int:
+        """The most of them that may fail."""
+        return next(m for m in count() if self.shown(m + 1) < self.share)
+
+    @cached_property
+    def given_up(self) -> float:
+        """The largest share of failing machines q that the certificate confirms reliably.
+
+        P(at most `allowed` of `draws` fail | q) = I_{1-q}(draws - allowed, allowed + 1)
+        """
+        others = self.draws - self.allowed, self.allowed + 1
+        return 1.0 - float(betaincinv(*others, self.options.reliable))
