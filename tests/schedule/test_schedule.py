@@ -15,8 +15,7 @@ from oracles.case_documents import QUICK_SECTIONS
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.deployment.realisation import takeover
-from ccd_casadi.extensions.schedule.handover import controllers_of, part_at
+from ccd_casadi.extensions.schedule.handover import controllers_of, handovers, part_at
 from ccd_casadi.extensions.schedule.schedule_command import main
 from ccd_casadi.extensions.schedule.schedule_files import Schedule, write_code
 from ccd_casadi.extensions.schedule.segments import (
@@ -40,9 +39,9 @@ VARYING = QUICK_SECTIONS.replace(f"{LAST}[objective]", f"{LAST}varies = true\n[o
 
 
 def segment(low: float, high: float, gain: float) -> Segment:
-    """A part with a lead and a roll-off; nothing of it is judged."""
-    A, B = np.diag([-300.0, -900.0]), np.array([[1.0], [gain]])
-    K = StateSpace(A, B, np.array([[-2e4 * gain, 3e4]]), np.array([[gain * 1e2]]))
+    """A part with an integrator and two lags; nothing of it is judged."""
+    A, B = np.diag([0.0, -300.0 * gain, -900.0]), np.array([[1.0], [1.0], [gain]])
+    K = StateSpace(A, B, np.array([[1e3 * gain, -2e4, 3e4 * gain]]), np.array([[gain * 1e2]]))
     design = SimpleNamespace(controller=K, bandwidth=100.0)
     proof = SimpleNamespace(refuted=False, proven=True)
     judgement = SimpleNamespace(passed=True)
@@ -80,30 +79,34 @@ def test_the_code_hands_over_as_the_simulation_does(tmp_path: Path) -> None:
                     tmp_path / "schedule.c"], check=True)  # fmt: skip
     code = ctypes.CDLL(str(library))
     K = controllers_of(PARTS, SAMPLING)
-    X = [takeover(one) for one in K]
+    onwards = handovers(K)
     state = (ctypes.c_double * 8)()
     code.schedule_reset(state, ctypes.c_double(0.05))
     forces = (ctypes.c_double * 1)()
-    now, z, u = 0, np.zeros(2), np.zeros(1)
+    now, z, changes = 0, np.zeros(len(K[0].A)), 0
     rng = np.random.default_rng(0)
-    way = 0.5 - 0.48 * np.cos(np.linspace(0.0, 4.0 * np.pi, 400))
-    jumps = []
-    for p in way:
+    for p in 0.5 - 0.48 * np.cos(np.linspace(0.0, 4.0 * np.pi, 400)):
         e = rng.standard_normal(1) * 1e-3
         part = part_at(PARTS, now, float(p))
         if part != now:
-            z, last = X[part] @ np.append(e, u), u
-            now = part
-        else:
-            last = None
+            now, z, changes = part, onwards[now, part] @ z, changes + 1
         u = K[now].C @ z + K[now].D @ e
-        if last is not None:
-            jumps.append(abs(float(u[0] - last[0])) / abs(float(last[0])))
         z = K[now].A @ z + K[now].B @ e
         code.schedule_step(state, ctypes.c_double(p), (ctypes.c_double * 1)(*e), forces)
-        assert forces[0] == pytest.approx(u[0], rel=1e-12)
-    assert len(jumps) == 8
-    assert max(jumps) < 1e-9
+        assert forces[0] == pytest.approx(u[0], rel=1e-9)
+    assert changes == 8
+
+
+def test_a_constant_force_stays_at_a_handover() -> None:
+    """The integrator holds a load: with e = 0 the next part's force is the last one."""
+    K = controllers_of(PARTS, SAMPLING)
+    onwards, z = handovers(K), np.zeros(len(K[0].A))
+    for e in np.append(np.full(50, 1e-3), np.zeros(2000)):
+        u, z = K[0].C @ z + K[0].D[:, 0] * e, K[0].A @ z + K[0].B[:, 0] * e
+    z = onwards[0, 2] @ z
+    for _ in range(2000):
+        new, z = K[2].C @ z, K[2].A @ z
+        assert new == pytest.approx(u, rel=1e-6)
 
 
 def written(folder: Path, text: str = VARYING) -> Path:

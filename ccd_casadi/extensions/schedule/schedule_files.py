@@ -9,8 +9,13 @@ import numpy as np
 
 from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.codesign.result_entries import proof_dict, sections_controller
-from ccd_casadi.deployment.realisation import literal, literals, takeover
-from ccd_casadi.extensions.schedule.handover import RateOptions, RateTrial, controllers_of
+from ccd_casadi.deployment.realisation import literal, literals
+from ccd_casadi.extensions.schedule.handover import (
+    RateOptions,
+    RateTrial,
+    controllers_of,
+    handovers,
+)
 from ccd_casadi.extensions.schedule.segments import Alone, Segment, within
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -199,7 +204,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
         "low": literals(np.array([one.low for one in found.segments]), 4),
         "high": literals(np.array([one.high for one in found.segments]), 4),
         **{part: joined([getattr(one, part) for one in K]) for part in "ABCD"},
-        "X": joined([takeover(one) for one in K]),
+        "T": literals(handovers(K), 4),
     }  # fmt: skip
     for name in CODE:
         text = template(f"extensions/schedule/templates/{name}").render(values)

@@ -19,9 +19,9 @@ static const double C[] = {
 static const double D[] = {
     {{ D }}
 };
-/* State of a takeover: states x (errors, then forces). */
-static const double X[] = {
-    {{ X }}
+/* A part's state from that of another: parts before x parts after x states x states. */
+static const double T[] = {
+    {{ T }}
 };
 
 static int part_at(int now, double at)
@@ -63,14 +63,12 @@ void schedule_step(schedule_state *state, double at, const double e[SCHEDULE_ERR
     int i, j;
 
     if (part != state->part) {
-        const double *x = X + part * n * (SCHEDULE_ERRORS + SCHEDULE_FORCES);
+        const double *t = T + (state->part * SCHEDULE_PARTS + part) * n * n;
 
         for (i = 0; i < n; i++) {
             double sum = 0.0;
-            for (j = 0; j < SCHEDULE_ERRORS; j++)
-                sum += *x++ * e[j];
-            for (j = 0; j < SCHEDULE_FORCES; j++)
-                sum += *x++ * u[j];
+            for (j = 0; j < n; j++)
+                sum += *t++ * state->x[j];
             next[i] = sum;
         }
         for (i = 0; i < n; i++)

@@ -2,7 +2,7 @@
  *
  * Call schedule_step once every {{ period }} s ({{ rate }} Hz) with the measured {{ name }}; {{ delay }} s from
  * reading y to the new u at the actuator, and a zero-order hold.
- *   e: r - y in m; u: N, the last forces in, the new ones out
+ *   e: r - y in m; u: forces in N
  * {{ name }} may change by {{ allowed }} {{ unit }}/s: simulated, see schedule.json.
  * Compile with -ffp-contract=off where results have to be the same on every machine.
  */
