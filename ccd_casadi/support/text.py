@@ -95,9 +95,9 @@ def of_newtons(unit: str) -> str:
     Examples
     --------
     >>> of_newtons("N"), of_newtons("N m")
-    (' if its input is in N ([units])', '')
+    (' if its input is in N', '')
     """
-    return " if its input is in N ([units])" if unit == "N" else ""
+    return " if its input is in N" if unit == "N" else ""
 
 
 def display_unit(unit: str, largest: float) -> tuple[str, float]:

@@ -276,7 +276,7 @@ def test_every_solve_of_an_own_plant_says_how_large_it_is(
     show_findings(case, problem_of(case))
     line = capsys.readouterr().err.splitlines()[0].removeprefix("note: in SI, at the start: ")
     moved, *words = line.split(", ")
-    assert moved == "the mass felt by an actuator is 135 kg if its input is in N ([units])"
+    assert moved == "the mass felt by an actuator is 135 kg if its input is in N"
     assert words[0].startswith("the first resonance is at ")
     assert words[1].startswith("M_K suits a bandwidth of ")
 
