@@ -140,6 +140,8 @@ def examined(common_folder: Callable[[str], Any], solved: Callable[[str], Path])
                 for command, *words in (
                     ("robustness", making), ("deploy", making),
                     ("insight", making, "--points", "3", "--workers", "1"),
+                    ("feedforward", making, "--controller", making / "deploy/controller.json",
+                     "--taps", "1"),
                     ("report", making, "--brief"), ("report", other, making),
                 ):  # fmt: skip
                     main = import_module(f"ccd_casadi.{command}").main

@@ -113,7 +113,12 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             _raised(axes, legend_height(names), panel.log_y)
             labels = _labels(axes, panel)
             where, _ = labels.corner(names)
-        axes.legend(loc=cast(Any, where), borderaxespad=0.2)
+        alone = len(names) == 1  # its name is enough
+        bare = {"handlelength": 0.0, "handletextpad": 0.0, "frameon": False} if alone else {}
+        made = axes.legend(loc=cast(Any, where), borderaxespad=0.2, **bare)
+        for handle in made.legend_handles if alone else ():
+            if handle is not None:
+                handle.set_visible(False)
     for put in labels.words():
         _write(axes, put)
 

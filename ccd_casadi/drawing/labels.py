@@ -138,7 +138,8 @@ class Labels:
 
     def _corners(self, names: Sequence[str]) -> dict[str, Box]:
         left, bottom, right, top = self._inside
-        wide, tall = LETTER * max(map(len, names)) + HANDLE, legend_height(names)
+        wide, tall = LETTER * max(map(len, names)), legend_height(names)
+        wide += HANDLE if len(names) > 1 else LETTER
         middle = 0.5 * (left + right - wide)
         across = {"right": right - wide, "left": left, "center": middle}
         up = {"upper": top - tall, "lower": bottom, "center": 0.5 * (bottom + top - tall)}

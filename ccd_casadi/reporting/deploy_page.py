@@ -131,10 +131,8 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
 
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[c.Block, ...]:
-    rows = figure_rows(run, found)
-    rows.append(("Slowest sampled mode", number(found.sampled.spectral_radius, 8), "below 1"))
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
-    return c.Facts(tuple(rows)), *(_words("unstable") if unstable else ())
+    return c.Facts(tuple(figure_rows(run, found))), *(_words("unstable") if unstable else ())
 
 
 def _step(run: FinishedRun, found: Deployment) -> c.Figure:

@@ -26,7 +26,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
 
 POINTS = 600
-STEPS = 200  # points of a force step
+STEPS = 200  # points of a force step, and again as many about its beginning
 DRAWN = 1200  # points of a curve of a move on the machine
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 MASS_ERRORS = (-0.01, 0.01)  # relative, of what feedforward takes the mass for
@@ -141,8 +141,9 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     drawn = []
     for loop in loops:
         t, y = force_response(loop, bandwidth, seconds)
-        spread = np.geomspace(t[1], min(t[-1], seconds), STEPS)
-        kept = np.unique(np.searchsorted(t, [*spread[:-1], most.seconds]))
+        end = min(t[-1], seconds)
+        spread = np.append(np.geomspace(t[1], end, STEPS)[:-1], np.linspace(0.0, end, STEPS)[:-1])
+        kept = np.unique(np.searchsorted(t, [*spread, most.seconds]))
         drawn.append(y[most.actuator, most.output][kept])
     t, y = t[kept], np.array(drawn)
     unit, factor = display_unit(spoken("m"), most.size)
@@ -150,7 +151,7 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     top = factor * y[most.plant, np.searchsorted(t, most.seconds)]
     mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, spoken("m")))
     step = f"y after a step of {spoken('1 N')} ({unit})"
-    panel = c.Panel("time (ms)", step, curves, bands, log_x=True, marks=(mark,))
+    panel = c.Panel("time (ms)", step, curves, bands, marks=(mark,))
     scalar = view.scalar and not loops[0].ported
     words = paragraph("report.force", most, len(loops), scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))

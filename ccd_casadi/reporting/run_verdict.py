@@ -118,6 +118,7 @@ PAGES = {
     "insight.html": "the front of cost against bandwidth, and what loosening each bound would gain",
     "robustness.html": "margins, plants off the model, hardware tolerances, a move",
     "*/report.html": "order, rate, code, the move on the machine",
+    "feedforward/report.html": "feedforward and shaper of a move, for every plant of the set",
 }
 FILES = {
     "result.json": "every figure of the run", "report.json": "what the pages show",

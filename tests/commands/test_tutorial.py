@@ -5,8 +5,8 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from oracles.sources import ROOT, files_of
 
-ROOT = Path(__file__).parents[2]
 TUTORIAL, NOMINAL = (ROOT / "docs" / f"{name}.md" for name in ("tutorial", "mixed_sensitivity"))
 BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGES = {
@@ -34,11 +34,6 @@ def commands(block: str) -> list[tuple[str, list[str]]]:
         elif line != "...":
             found[-1][1].append(line)
     return found
-
-
-def files(page: Path) -> set[tuple[str, str]]:
-    """Title and text of every file that a page has written."""
-    return {(title, body) for _, title, body in BLOCK.findall(page.read_text()) if title}
 
 
 def commands_of(page: Path) -> list[tuple[str, list[str]]]:
@@ -77,7 +72,7 @@ def test_every_command_gives_what_the_page_shows(
     In this process: what starts a command, `test_start` tests.
     """
     monkeypatch.chdir(tmp_path)
-    for title, body in files(TUTORIAL) | files(page):
+    for title, body in (files_of(TUTORIAL) | files_of(page)).items():
         (tmp_path / title).write_text(body)
     ran = 0
     for command, shown in commands_of(page):

@@ -140,6 +140,22 @@ def test_a_shaper_settles_earlier_where_a_mode_rings() -> None:
     assert times[1] < times[0]
 
 
+@pytest.mark.parametrize("some", [LOOPS[:1], LOOPS])
+def test_the_inverse_is_a_solution_once_it_is_within_the_window_less_the_margin(
+    some: list[Loop],
+) -> None:
+    """Also where no coefficients are earlier: where the search ends there is one."""
+    plants, x, shape = responses(some), inverse(Shape(ORDERS, 1)), Shape(ORDERS, 1)
+    limits = ForceLimits(max(p.peak(x) for p in plants), max(p.heat(x) for p in plants))
+    for window in np.geomspace(1e-6, 1e-3, 7):
+        margin = LeastTimeOptions().margin
+        latest = max(p.settled(x, (1.0 - margin) * window) for p in plants)
+        if np.isfinite(latest):
+            found = least_time(plants, shape, float(window), limits, latest, x)
+            assert found is not None
+            assert found.time <= latest + SAMPLING.period
+
+
 def test_a_time_that_is_too_early_is_refused() -> None:
     plants, shape = responses(), Shape(ORDERS, 1)
     limits = ForceLimits(1e3, 1e6)

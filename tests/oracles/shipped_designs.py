@@ -29,10 +29,9 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.text import HZ
+from oracles.sources import ROOT, files_of
 
-ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "tests/data/shipped_designs.json"
-TITLED = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 SECTIONS = re.compile(r"^```toml\n(\[controller\].*?)^```$", re.MULTILINE | re.DOTALL)
 FIGURES = (
     "bandwidth_hz", "crossover_hz", "phase_margin_deg", "gain_margin", "delay_margin_us",
@@ -43,8 +42,7 @@ FIGURES = (
 
 def tutorial(page: str, title: str) -> str:
     """A file that a page has its reader write."""
-    text = (ROOT / "docs" / f"{page}.md").read_text()
-    return dict(TITLED.findall(text))[title]
+    return files_of(ROOT / "docs" / f"{page}.md")[title]
 
 
 def built() -> str:

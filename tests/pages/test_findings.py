@@ -30,9 +30,10 @@ FINDINGS = {
                   f"{HEAD}.querySelector('details:not([open])').textContent.includes('verdict')"),
     "B3": Finding("ends of the [robust] set in the four plots, and words", "",
                   "tests/pages/test_findings.py::test_the_ends_of_the_set_are_drawn"),
-    "B4": Finding("every page names its feedforward; open: one table, plant by feedforward",
-                  "deploy/report.html",
-                  "document.body.textContent.includes('with feedforward: the error is at most')"),
+    "B4": Finding("one table of feedforward by plant, with errors of 1 %", "report.html",
+                  "[...document.querySelectorAll('table')].some(one => ['feedforward', 'plant', "
+                  "'feedforward -1 %', 'feedforward +1 %'].every(word => "
+                  "one.textContent.includes(word)))"),
     "B5": Finding("derivatives per 1 %, sorted, as bars", "insight.html",
                   "document.body.textContent.includes('1 % more of')"),
     "B6": Finding("the rate at the design, no average; no line through a hollow front", "",
@@ -60,7 +61,8 @@ FINDINGS = {
     "C1": Finding("one ground for |S|", "report.html",
                   "document.querySelectorAll(\"svg[aria-label='At a glance: |S| (–)'] "
                   "[id*=area]\").length === 1"),
-    "C2": Finding("open: the legend of one curve names what is shown, as 'with feedforward'"),
+    "C2": Finding("a single curve has its name without a box", "",
+                  "tests/pages/test_labels.py::test_a_single_curve_has_its_name_and_no_box"),
     "C3": Finding("the co-design is blue in the comparison too", "",
                   "ccd_casadi/studies/compare_page.py::comparison.method(best), comparison"),
     "C4": Finding("labels keep apart", "",
@@ -71,14 +73,17 @@ FINDINGS = {
     "C6": Finding("provenance is folded", "report.html",
                   "[...document.querySelectorAll('details.chapter summary')]"
                   ".some(one => one.textContent.includes('Provenance'))"),
-    "C7": Finding("open: the step of a force keeps its logarithmic time: it spans 1 ms to 10 s"),
+    "C7": Finding("the step of a force has linear time", "report.html",
+                  "JSON.parse(document.querySelector('svg[aria-label*=\"after a step of\"]')"
+                  ".dataset.axes).scales[0][2] === 0"),
     "C8": Finding("the shadow of a table that goes on does not hide it", "",
                   "tests/pages/test_pages_in_browser.py::"
                   "test_a_table_that_goes_on_has_a_shadow_there"),
     "C9": Finding("dark buttons, no empty room, axis titles of 12 px", "",
                   "tests/pages/test_explore_page.py::"
                   "test_a_notch_is_dragged_and_a_pin_is_on_the_map_without_scrolling"),
-    "C10": Finding("open: pictures of the site are light in both themes, 900 px wide"),
+    "C10": Finding("pictures are dark in the dark theme; open: at 390 px their words are small", "",
+                   "docs/site.css::filter: invert"),
     "C11": Finding("no bytecode in the site", "", "mkdocs.yml::__pycache__"),
     "C12": Finding("figures for developers are folded", "report.html",
                    "!document.querySelector('.lead').textContent.includes('‖')"),
@@ -87,9 +92,10 @@ FINDINGS = {
                   f"{TABLE}.textContent.startsWith('requirement')"),
     "D2": Finding("a notch is dragged in the Bode plot", "",
                   "tests/pages/test_explorer.py::test_a_notch_is_judged_as_its_response_has_it"),
-    "D3": Finding("two runs side by side; open: history and parallel coordinates",
+    "D3": Finding("two runs side by side; open: history and parallel coordinates, which need the "
+                  "samples of a run in its page",
                   "changes.html", f"{TABLE}.textContent.startsWith('requirement')"),
-    "D4": Finding("open: who depends on whom, and a coloured Jacobian"),
+    "D4": Finding("open: a coloured Jacobian is for many parameters, and insight has bars for few"),
     "D5": Finding("margins drawn on Bode", "report.html",
                   "[...document.querySelectorAll('svg')].some(one => "
                   "(one.getAttribute('aria-label') ?? '').startsWith('Bode plot') || "
@@ -111,7 +117,8 @@ SAID = (
     "Per unit of the parameter", "no weights' frequencies to move", "others above S_max;",
     "largest is allowed bounds a part", "is wider by what",
 )  # fmt: skip
-PAGES = ("index", "report", "brief", "changes", "insight", "robustness", "deploy/report")
+PAGES = ("index", "report", "brief", "changes", "insight", "robustness", "deploy/report",
+         "feedforward/report")  # fmt: skip
 WIDTHS = (390, 1400, 1920)
 
 
@@ -150,7 +157,8 @@ def test_no_page_is_wide_or_hard_to_use(browser, examined, name, scheme):
     page.close()
 
 
-@pytest.mark.parametrize("name", ["report", "robustness", "changes", "deploy/report"])
+@pytest.mark.parametrize("name", ["report", "robustness", "changes", "deploy/report",
+                                  "feedforward/report"])  # fmt: skip
 def test_no_axis_is_without_a_unit(browser, examined, name):
     """A panel is named by its axis: a unit in brackets, or a dash."""
     page = browser.new_page()

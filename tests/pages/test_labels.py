@@ -40,6 +40,17 @@ def test_legend_and_words_lie_on_no_curve(seed: int, width: float) -> None:
         assert inside(axes.texts[0].get_window_extent(), curve) == 0
 
 
+@pytest.mark.parametrize("names", [("alone",), ("one", "other")])
+def test_a_single_curve_has_its_name_and_no_box(names: tuple[str, ...]) -> None:
+    curves = tuple(Curve(TIME, np.sin(TIME / (9.0 + i)), name) for i, name in enumerate(names))
+    with style():
+        _, axes = drawn_axes(Panel("time (ms)", "error (nm)", curves), WIDTH, 2.4)
+    made, several = axes.get_legend(), len(names) > 1
+    assert [text.get_text() for text in made.get_texts()] == list(names)
+    assert made.get_frame_on() == several
+    assert [handle.get_visible() for handle in made.legend_handles] == [several] * len(names)
+
+
 @pytest.mark.parametrize("size", [(500, 150), (253, 127), (180, 120)])
 def test_words_of_the_explorer_are_inside_and_apart(size: tuple[int, int]) -> None:
     pytest.importorskip("bokeh", reason="bokeh is not installed")

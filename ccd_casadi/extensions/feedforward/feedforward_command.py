@@ -42,7 +42,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.analysis.setpoint import setpoint
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-    from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.feedforward.feedforward_files import entry, summary, write_code
     from ccd_casadi.extensions.feedforward.feedforward_page import feedforward_page
     from ccd_casadi.extensions.feedforward.set_feedforward import (
@@ -50,6 +49,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         profile_of,
         set_feedforward,
     )
+    from ccd_casadi.reporting.run_verdict import index_of, publish
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 
@@ -73,7 +73,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     write_json(folder / FILE, answer)
     write_code(folder, answer)
     inform("\n".join(summary(found)))
-    write_page(folder / "report.html", feedforward_page(run, found))
+    publish(run.folder, folder / "report.html", feedforward_page(run, found, index_of(folder)))
     inform(f"page          {folder / 'report.html'}")
     return _ended(found)
 

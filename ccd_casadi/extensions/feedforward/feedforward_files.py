@@ -56,8 +56,7 @@ def entry(found: SetFeedforward, axis: int) -> dict[str, Any]:
 
 def summary(found: SetFeedforward) -> list[str]:
     """The lines that the command prints."""
-    shape, unit = found.found.shape, spoken("m")
-    far = with_unit(float(np.abs(found.responses[0].end).max()), unit)
+    shape = found.found.shape
     taps = "none" if shape.taps == 1 else (
         f"{shape.taps} taps {1e3 * shape.spacing * found.responses[0].period:.4g} ms apart: "
         + ", ".join(f"{value:.4g}" for value in shape.split(found.found.x)[0])
@@ -68,14 +67,13 @@ def summary(found: SetFeedforward) -> list[str]:
         else "the case has no set to draw plants from: the model, and what it lists, alone"
     )  # fmt: skip
     rows = {
-        "move": f"{far} in {1e3 * found.profile.duration:.4g} ms, settled within "
-        f"±{with_unit(found.window, unit)}",
-        "latest plant": f"{_ms(found.latest)} with this feedforward, "
-        f"{_ms(found.latest_inverse)} with the model's inverse",
-        "model": f"{_ms(found.settled[0])}, {_ms(found.settled_inverse[0])} with its inverse",
+        "move": moved(found),
+        "latest plant": f"{in_ms(found.latest)} with this feedforward, "
+        f"{in_ms(found.latest_inverse)} with the model's inverse",
+        "model": f"{in_ms(found.settled[0])}, {in_ms(found.settled_inverse[0])} with its inverse",
         "judged": judged,
         "shaper": taps,
-        "forces": f"peak {found.peak:.4g} N (inverse {found.limits.peak:.4g}), heat "
+        "forces": f"peak {found.peak:.4g} {spoken('N')} (inverse {found.limits.peak:.4g}), heat "
         f"{100.0 * found.heat / found.limits.heat:.3g} % of the inverse's",
         "learning": f"an error of the coefficients falls to {100.0 * found.contraction:.3g} % or "
         "less with each move, on every plant of the design" if found.contraction < 1.0
@@ -84,7 +82,16 @@ def summary(found: SetFeedforward) -> list[str]:
     return [f"{name:14s}{words}" for name, words in rows.items()]
 
 
-def _ms(seconds: float) -> str:
+def moved(found: SetFeedforward) -> str:
+    """`10 mm in 180 ms, settled within ±1 µm`."""
+    unit = spoken("m")
+    far = with_unit(float(np.abs(found.responses[0].end).max()), unit)
+    window = with_unit(found.window, unit)
+    return f"{far} in {1e3 * found.profile.duration:.4g} ms, settled within ±{window}"
+
+
+def in_ms(seconds: float) -> str:
+    """A time, which may be infinite, in words."""
     return f"{1e3 * seconds:.4g} ms" if np.isfinite(seconds) else "not within what was simulated"
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREY
+from ccd_casadi.extensions.feedforward.feedforward_files import in_ms, moved
 from ccd_casadi.extensions.feedforward.move_responses import MoveResponses
 from ccd_casadi.extensions.feedforward.set_feedforward import SetFeedforward
 from ccd_casadi.reporting.facts import run_name
@@ -30,24 +31,26 @@ class FeedforwardPageOptions:
     least: float = 1e-3
 
 
-def feedforward_page(run: FinishedRun, found: SetFeedforward) -> c.Page:
+def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -> c.Page:
     """Make report.html.
 
     Parameters
     ----------
     run : FinishedRun
     found : SetFeedforward
+    index : str
+        Address of the page that links all pages of the run.
 
     Returns
     -------
     Page
     """
     good = found.kept == len(found.judged)
-    ms = [1e3 * found.latest, 1e3 * found.latest_inverse]
     drawn = f"{found.kept} of {len(found.judged)} plants drawn from the set settle in time"
     lead = (
-        f"The latest plant of the set settles after {ms[0]:.4g} ms; with the model's inverse as "
-        f"feedforward after {ms[1]:.4g} ms. No plant needs more heat or more peak force than the "
+        f"A move of {moved(found)}: the latest plant of the set settles after "
+        f"{in_ms(found.latest)}; with the model's inverse as feedforward, "
+        f"{in_ms(found.latest_inverse)}. No plant needs more heat or more peak force than the "
         "inverse needs at most."
     )
     head = c.Head(
@@ -64,12 +67,12 @@ def feedforward_page(run: FinishedRun, found: SetFeedforward) -> c.Page:
     ]  # fmt: skip
     names = {0: "position (N/m)", 1: "velocity (N s/m)", 2: "acceleration (kg)",
              3: "jerk (kg s)", 4: "snap (kg s²)"}  # fmt: skip
-    per = (f"per {names[j]}" for j in found.found.shape.orders)
+    per = (spoken(f"per {names[j]}") for j in found.found.shape.orders)
     table = c.Table(("delay (ms)", "of the setpoint (–)", *per), tuple(rows))
     return c.Page(head, (
         c.Chapter("The move on every plant", (_errors(found),)),
         c.Chapter("The coefficients", (table,)),
-    ), index="")  # fmt: skip
+    ), index)  # fmt: skip
 
 
 def _errors(
@@ -102,7 +105,7 @@ def _errors(
     panels = (
         c.Panel("time (ms)", f"distance to the end ({unit})", (*old, *new),
                 levels=(window, done), log_y=True),
-        c.Panel("time (ms)", "largest force of a motor (N)",
+        c.Panel("time (ms)", spoken("largest force of a motor (N)"),
                 (c.Curve(ms, force(some[0], found.inverse), "the model's inverse", GREY),
                  c.Curve(ms, force(shaped[0], found.found.x), "this feedforward", BLUE)),
                 levels=(done,)),

@@ -114,8 +114,9 @@ class _Programme:
         large = options.largest
         self.bounds = [(0.0, large)] * shape.taps + [(-large, large)] * (c - shape.taps)
 
-    def least(self, first: int, z: Array) -> tuple[float, Array | None]:
-        """s and z where errors count from sample `first` on; infinite, None: no solution."""
+    def least(self, first: int, z: Array, most: float) -> tuple[float, Array | None]:
+        """s and z where errors count from sample `first` on; infinite, None: no solution, or none
+        with s <= `most`."""
         counts, bound, tight = self.sample >= first, -1.0, self.options.tight
         for _ in range(self.options.rounds):
             left = np.where(counts, np.abs(self.right - self.rows @ z), 0.0)
@@ -133,7 +134,7 @@ class _Programme:
             signed = np.sign(pushed[strong])[:, None] * self.motors[strong]
             self.limits = np.vstack([self.limits, signed, tangents])
             found = self._solved(self.used[counts[self.used]])
-            if found is None:
+            if found is None or found[1] > most:  # more rows do not lower s
                 break
             z, bound = found
         return np.inf, None
@@ -204,12 +205,12 @@ def least_time(
     )  # fmt: skip
     most = 1.0 - options.margin
     low, high = 0, min(int(np.ceil(latest / period)), error.shape[1] - 1)
-    s, z = programme.least(high, start / size)
+    s, z = programme.least(high, start / size, most)
     if z is None or s > most:
         return None
     while high - low > 1:
         middle = (low + high) // 2
-        trial, there = programme.least(middle, z)
+        trial, there = programme.least(middle, z, most)
         if there is not None and trial <= most:
             high, s, z = middle, trial, there
         else:

@@ -17,7 +17,12 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.robust_set import members
 from ccd_casadi.extensions.feedforward.learning import contraction, learning_gain
-from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTime, least_time
+from ccd_casadi.extensions.feedforward.least_time import (
+    ForceLimits,
+    LeastTime,
+    LeastTimeOptions,
+    least_time,
+)
 from ccd_casadi.extensions.feedforward.move_responses import MoveResponses, Shape, responses_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
@@ -152,11 +157,12 @@ def set_feedforward(
     one, samples = Shape(orders, model.B.shape[1]), 0
     x = one.joined(np.ones(1), inverse[None])
     respond = partial(_responses, run, profile=profile, orders=orders, axis=axis)
+    least = window * (1.0 - LeastTimeOptions().margin)  # in which the inverse is a solution, too
     for doubling in range(options.doublings + 1):
         length = profile.duration * (1.0 + options.tail * 2.0**doubling)
         samples = int(np.ceil(length * _rate(run)))
         responses = respond(plants, samples=samples)
-        late = np.array([response.settled(x, window) for response in responses])
+        late = np.array([response.settled(x, least) for response in responses])
         if (late < 0.75 * length).all():  # no beat comes after it
             break
     limits = ForceLimits(max(item.peak(x) for item in responses),

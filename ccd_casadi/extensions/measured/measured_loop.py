@@ -182,7 +182,7 @@ def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: li
             f"{hz[open_[-1] + 1]:.4g} Hz do not exclude one of {least:g}: measure more lines there"
             ", or state the least damping of the plant (--least-damping, least_damping)"
         )  # fmt: skip
-    return f"no resonance of less damping than {least:g} hides between two lines"
+    return f"a resonance that hides between two lines has a damping of {least:g} at least"
 
 
 def winding(
