@@ -20,7 +20,7 @@ from ccd_casadi.extensions.schedule.schedule_command import main
 from ccd_casadi.extensions.schedule.schedule_files import Schedule, write_code
 from ccd_casadi.extensions.schedule.segments import (
     Alone,
-    Part,
+    DesignedPart,
     ScheduleOptions,
     Segment,
     halved,
@@ -142,11 +142,11 @@ def test_halving_ends_where_every_part_has_its_share() -> None:
     alone = [Alone(at, 100.0 - 30.0 * at) for at in np.linspace(0.0, 1.0, 9)]
     searched = []
 
-    def search(low: float, high: float, warm: Any = None) -> Part:
+    def search(low: float, high: float, warm: Any = None) -> DesignedPart:
         found = (100.0 - 30.0 * high) * (1.0 - 0.3 * (high - low))
         searched.append((low, high))
         assert warm is None or warm.bandwidth <= found
-        return Part(low, high, cast(Any, None), cast(Any, SimpleNamespace(bandwidth=found)))
+        return DesignedPart(low, high, cast(Any, None), cast(Any, SimpleNamespace(bandwidth=found)))
 
     parts = halved(search(0.0, 1.0), alone, search, options=ScheduleOptions(most=64))
     assert parts[0].low == 0.0

@@ -18,7 +18,7 @@ _VALUE = re.compile(r"[-+]?\d*\.\d+(?:[EeDd]?[-+]\d+)?")
 _VECTOR = re.compile(r"R E A L   E I G E N V E C T O R   N O \.\s+(\d+)")
 
 
-class Modes(NamedTuple):
+class ReadModes(NamedTuple):
     """As a file has them: Hz, modal masses, and displacements (6,) at nodes, mode by mode."""
 
     hz: list[float]
@@ -40,7 +40,7 @@ class ResultFormat:
 
     program: str
     remedy: str
-    read: Callable[[Path], Modes]
+    read: Callable[[Path], ReadModes]
 
 
 def read_modes(path: Path) -> ResultModes:
@@ -96,7 +96,7 @@ def _lines(path: Path) -> list[str]:
     return path.read_text(encoding="latin-1").splitlines()
 
 
-def _op2(path: Path) -> Modes:
+def _op2(path: Path) -> ReadModes:
     """Tables LAMA and OUG of Nastran: eigenvalues with modal masses, displacements at grid points.
 
     Directions are those of each point's own output coordinate system.
@@ -112,7 +112,7 @@ def _op2(path: Path) -> Modes:
         words = f"holds {len(sets)} sets of eigenvectors and {len(tables)} of eigenvalues"
         raise PlantError(f"{path}: {words}, as of superelements or subcases; write one")
     if not sets:
-        return Modes([], [], [])
+        return ReadModes([], [], [])
     if not tables:
         words = "has eigenvectors and no table LAMA of modal masses"
         raise PlantError(f"{path}: {words}; write it too (PARAM,POST,-1)")
@@ -124,7 +124,7 @@ def _op2(path: Path) -> Modes:
     nodes, directions = (shapes.index.get_level_values(i).to_numpy(int) for i in (0, 1))
     values = shapes.to_numpy(float)
     vectors = _by_node(values.T, nodes, directions - 1)
-    return Modes(hz[places].tolist(), masses[places].tolist(), vectors)
+    return ReadModes(hz[places].tolist(), masses[places].tolist(), vectors)
 
 
 def _require_positive(path: Path, eigenvalues: Array, *, rigid_hz: float = 0.1) -> None:
@@ -146,7 +146,7 @@ def _by_node(values: Array, nodes: Array, directions: Array) -> list[dict[int, A
     return found
 
 
-def _unv(path: Path, *, normal_mode: int = 2, displacement: int = 8, real: int = 2) -> Modes:
+def _unv(path: Path, *, normal_mode: int = 2, displacement: int = 8, real: int = 2) -> ReadModes:
     """Datasets 55 of a universal file: real normal modes, displacements, by pyuff."""
     pyuff = require("pyuff", "uff")
     file = pyuff.UFF(str(path))
@@ -163,10 +163,10 @@ def _unv(path: Path, *, normal_mode: int = 2, displacement: int = 8, real: int =
         vectors.append(dict(zip(nodes.tolist(), np.stack(rows, axis=1), strict=True)))
         frequencies.append(float(one["freq"]))
         masses.append(float(one["modal_m"]))
-    return Modes(frequencies, masses, vectors)
+    return ReadModes(frequencies, masses, vectors)
 
 
-def _rst(path: Path, *, modal: int = 2) -> Modes:
+def _rst(path: Path, *, modal: int = 2) -> ReadModes:
     """Nodal displacements of a modal analysis of ANSYS, in global directions."""
     reader = require("ansys.mapdl.reader", "ansys")
     file = reader.read_binary(str(path))
@@ -185,10 +185,10 @@ def _rst(path: Path, *, modal: int = 2) -> Modes:
         words = "its modes are normalised to unity, so that their modal masses are not known"
         raise PlantError(f"{path}: {words}; leave Nrmkey of MODOPT off")
     frequencies = [float(hz) for hz in file.time_values]
-    return Modes(frequencies, [1.0] * len(vectors), vectors)
+    return ReadModes(frequencies, [1.0] * len(vectors), vectors)
 
 
-def _frd(path: Path) -> Modes:
+def _frd(path: Path) -> ReadModes:
     """Displacement blocks that carry a mode: `100C` line, `-4 DISP`, ` -1` rows of fixed width."""
     frequencies: list[float] = []
     vectors: list[dict[int, Array]] = []
@@ -208,10 +208,10 @@ def _frd(path: Path) -> Modes:
         elif reading and line.startswith(" -1"):
             values = [float(line[13 + 12 * k : 25 + 12 * k]) for k in range(3)]
             vectors[-1][int(line[3:13])] = np.array([*values, 0.0, 0.0, 0.0])
-    return Modes(frequencies, [1.0] * len(frequencies), vectors)
+    return ReadModes(frequencies, [1.0] * len(frequencies), vectors)
 
 
-def _f06(path: Path) -> Modes:
+def _f06(path: Path) -> ReadModes:
     """The table of real eigenvalues, and the blocks of real eigenvectors over all pages."""
     frequencies: list[float] = []
     masses: list[float] = []
@@ -232,7 +232,7 @@ def _f06(path: Path) -> Modes:
         elif block is not None and len(words) > 2 and words[0].isdigit() and words[1] == "G":
             values = _VALUE.findall(line)
             block[int(words[0])] = np.array([_float(value) for value in values[:6]])
-    return Modes(frequencies, masses, [vectors[i] for i in sorted(vectors)])
+    return ReadModes(frequencies, masses, [vectors[i] for i in sorted(vectors)])
 
 
 def _float(text: str) -> float:

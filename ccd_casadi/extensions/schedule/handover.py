@@ -36,7 +36,7 @@ from ccd_casadi.support.arrays import Array
 
 
 @dataclass(frozen=True)
-class RateOptions:
+class CrossingOptions:
     """Numbers of the simulation on the way.
 
     Attributes
@@ -114,7 +114,7 @@ def part_at(segments: Sequence[Segment], now: int, p: float) -> int:
 
 def rates_tried(
     problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
-    *, seed: int = 0, options: RateOptions = RateOptions(),
+    *, seed: int = 0, options: CrossingOptions = CrossingOptions(),
 ) -> list[RateTrial]:  # fmt: skip
     """Simulate the way over the whole range at rising rates, until the motion rises too much.
 
@@ -125,7 +125,7 @@ def rates_tried(
         Of a sampled loop.
     seed : int
         Of the force.
-    options : RateOptions
+    options : CrossingOptions
 
     Returns
     -------

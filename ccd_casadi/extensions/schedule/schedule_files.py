@@ -11,7 +11,7 @@ from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.codesign.result_entries import proof_dict, sections_controller
 from ccd_casadi.deployment.realisation import literal, literals
 from ccd_casadi.extensions.schedule.handover import (
-    RateOptions,
+    CrossingOptions,
     RateTrial,
     controllers_of,
     handovers,
@@ -90,7 +90,7 @@ class Schedule:
     @property
     def allowed(self) -> float:
         """The highest rate of the simulation that is allowed; 0: none."""
-        kept = [one.rate for one in self.rates if one.rise <= RateOptions().rise]
+        kept = [one.rate for one in self.rates if one.rise <= CrossingOptions().rise]
         return max(kept, default=0.0)
 
     @property
@@ -175,7 +175,7 @@ def summary(found: Schedule) -> list[str]:
         ("judged", f"{kept} of {counted(len(found.frozen), 'position')} keep every bound"),
         ("proven", f"{found.proven} of {counted(len(found.segments), 'part')}"),
         ("rate", f"up to {found.allowed:.3g}{unit}/s: the largest motion rises by "
-         f"{100.0 * (RateOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
+         f"{100.0 * (CrossingOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
          if found.allowed else "none of the simulated rates keeps the loop quiet"),
     ]  # fmt: skip
     return [f"{name:14s}{words}" for name, words in rows]

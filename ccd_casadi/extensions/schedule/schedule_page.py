@@ -4,7 +4,7 @@ import numpy as np
 
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
-from ccd_casadi.extensions.schedule.handover import RateOptions
+from ccd_casadi.extensions.schedule.handover import CrossingOptions
 from ccd_casadi.extensions.schedule.schedule_files import Schedule
 from ccd_casadi.support.text import HZ
 
@@ -71,7 +71,7 @@ def _rates(found: Schedule, unit: str) -> c.Figure:
         f"rate of {found.name} ({unit}/s)", "largest motion, over that at rest (–)",
         (c.Curve(np.array([one.rate for one in shown]), np.array([one.rise for one in shown]),
                  marker="o"),),
-        levels=(c.Level(RateOptions().rise, "allowed"),), log_x=True,
+        levels=(c.Level(CrossingOptions().rise, "allowed"),), log_x=True,
     )  # fmt: skip
     words = (
         f"{found.name} crosses its range at a constant rate under a random force; simulated, not "

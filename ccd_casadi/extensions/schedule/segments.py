@@ -134,7 +134,7 @@ def within(problem: CoDesignProblem, name: str, low: float, high: float) -> CoDe
 
 
 @dataclass(frozen=True)
-class Part:
+class DesignedPart:
     """A part of the range with the controller that was found for it."""
 
     low: float
@@ -143,7 +143,7 @@ class Part:
     design: SectionsDesign
 
 
-Search = Callable[[float, float, SectionsDesign | None], Part]
+Search = Callable[[float, float, SectionsDesign | None], DesignedPart]
 
 
 def designed(
@@ -191,8 +191,10 @@ def segments_of(
     low, high = next((a, b) for own, a, b in structured_of(problem).uncertainty.ranges
                      if own == name)  # fmt: skip
 
-    def search(a: float, b: float, warm: SectionsDesign | None = None) -> Part:
-        return Part(a, b, *designed(within(problem, name, a, b), theta, warm, tell, workers))
+    def search(a: float, b: float, warm: SectionsDesign | None = None) -> DesignedPart:
+        return DesignedPart(
+            a, b, *designed(within(problem, name, a, b), theta, warm, tell, workers)
+        )
 
     alone = []
     for i, at in enumerate(np.linspace(low, high, options.positions).tolist(), 1):
@@ -209,23 +211,23 @@ def segments_of(
 
 
 def halved(
-    whole: Part, alone: Sequence[Alone], search: Search, tell: Tell = silent,
+    whole: DesignedPart, alone: Sequence[Alone], search: Search, tell: Tell = silent,
     options: ScheduleOptions = ScheduleOptions(),
-) -> list[Part]:  # fmt: skip
+) -> list[DesignedPart]:  # fmt: skip
     """Halve the part with the least share, until each has the required one, or there are enough.
 
     Parameters
     ----------
-    whole : Part
+    whole : DesignedPart
     alone : sequence of Alone
     search : callable
-        (low, high, a design that keeps every bound there) -> Part.
+        (low, high, a design that keeps every bound there) -> DesignedPart.
     tell : callable
     options : ScheduleOptions
 
     Returns
     -------
-    list of Part
+    list of DesignedPart
         Ascending.
     """
     parts = [whole]
@@ -243,7 +245,7 @@ def halved(
     return sorted(parts, key=lambda part: part.low)
 
 
-def share_of(part: Part, alone: Sequence[Alone]) -> float:
+def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
     """The least ω_b over that of a position alone, of the positions in a part; of a part between
     two of them, of these."""
     inside = [one for one in alone if part.low <= one.at <= part.high]
@@ -255,7 +257,7 @@ def share_of(part: Part, alone: Sequence[Alone]) -> float:
 
 
 def _judged(
-    parts: Sequence[Part], theta: Sequence[float], tell: Tell, workers: Pool
+    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool
 ) -> list[Segment]:
     found = []
     for i, part in enumerate(parts, 1):
