@@ -188,6 +188,6 @@ def improved(
     new = {"forces": shape.split(x)[1].tolist(), "learned": moves} | dict.fromkeys(OF_DESIGN)
     return json_values(dict(before) | new), [
         f"learned       from move {moves}, RMS of its error {with_unit(rms, spoken('m'))}",
-        "judged        unknown: these coefficients are not those that the page and its plants judge",
+        "judged        unknown: the page and its plants judge those before",
         f"coefficients  {path}, and feedforward.c beside it",
     ]  # fmt: skip
