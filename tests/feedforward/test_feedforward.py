@@ -4,6 +4,8 @@ import ctypes
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,7 +16,13 @@ from hypothesis import strategies as st
 from ccd_casadi.analysis.move import held_setpoint, simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
-from ccd_casadi.extensions.feedforward.feedforward_files import read_error, write_code
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.extensions.feedforward.feedforward_files import (
+    OF_DESIGN,
+    improved,
+    read_error,
+    write_code,
+)
 from ccd_casadi.extensions.feedforward.learning import (
     contraction,
     learned,
@@ -227,6 +235,34 @@ def test_what_is_no_log_is_refused_by_name(tmp_path: Path) -> None:
         read_error(log)
     log.write_text("time,error1,error2\n0,1e-6,2e-6\n1,3e-6,4e-6\n")
     np.testing.assert_allclose(read_error(log), [[1e-6, 2e-6], [3e-6, 4e-6]])
+    log.write_text("error2,error1\n2e-6,1e-6\n4e-6,3e-6\n")
+    np.testing.assert_allclose(read_error(log), [[1e-6, 2e-6], [3e-6, 4e-6]])
+    log.write_text("time,error_um\n0,1\n1,2\n")
+    with pytest.raises(UserError, match=r"error_um.*in m"):
+        read_error(log)
+    log.write_text("")
+    with pytest.raises(UserError, match="is empty"):
+        read_error(log)
+
+
+def test_what_is_learned_is_not_called_judged() -> None:
+    """Figures of the coefficients before are unknown of those after; µm for m are refused."""
+    shape, run = Shape(ORDERS, 1), cast(FinishedRun, SimpleNamespace(loop=loop()))
+    h, F = shape.split(inverse(shape))
+    before = {
+        "axis": 1, "orders": list(ORDERS), "taps": 1, "spacing": 1, "samples": SAMPLES,
+        "shaper": h.tolist(), "forces": F.tolist(), "contraction": 0.1, "learned": 0,
+        "setpoint": {"durations": MOVE.durations.tolist(), "snaps": MOVE.snaps.tolist()},
+        **dict.fromkeys(OF_DESIGN, 1.0),
+    }  # fmt: skip
+    error = 1e-6 * np.sin(np.arange(float(SAMPLES)))[:, None]
+    after, words = improved(run, Path("feedforward.json"), before, error)
+    assert after["learned"] == 1
+    assert after["forces"] != before["forces"]
+    assert all(after[name] is None for name in OF_DESIGN)
+    assert any("unknown" in line for line in words)
+    with pytest.raises(UserError, match="give the error in m"):
+        improved(run, Path("feedforward.json"), before, 1e6 * error)
 
 
 def test_a_loop_that_is_continuous_or_unstable_is_refused() -> None:
@@ -247,4 +283,3 @@ def test_a_margin_of_the_window_is_kept() -> None:
     assert found[1] is not None
     assert found[0].time <= found[1].time
     assert found[1].left <= 0.5 * 1.001
-

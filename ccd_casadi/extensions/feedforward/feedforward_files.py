@@ -19,6 +19,7 @@ from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import counted, spoken, template, with_unit
 
 CODE = ("feedforward.h", "feedforward.c")
+OF_DESIGN = ("settled", "settled_model", "kept", "heat", "peak_force")  # unknown once it learns
 
 
 def entry(found: SetFeedforward, axis: int) -> dict[str, Any]:
@@ -64,7 +65,7 @@ def summary(found: SetFeedforward) -> list[str]:
     judged = (
         f"{found.kept} of {counted(len(found.judged), 'plant')} drawn from the set have settled "
         f"by {1e3 * found.found.time:.4g} ms" if len(found.judged)
-        else "the case has no set to draw plants from: the model, and what it lists, alone"
+        else "not judged: the case has no set to draw plants from"
     )  # fmt: skip
     rows = {
         "move": moved(found),
@@ -115,17 +116,24 @@ def write_code(folder: Path, answer: Mapping[str, Any]) -> None:
 
 
 def read_error(log: Path) -> Array:
-    """The error of a move (N, q) from the columns of a CSV file whose names begin with `error`.
+    """The error of a move (N, q) from the columns `error`, or error1, error2, ..., of a CSV file.
 
-    Raises UserError where there is none, or a value is no number.
+    Raises UserError where there is none, one has another unit, or a value is no number.
     """
     if not log.exists():
         raise UserError(f"{log}: there is no such file; give the log of a move")
+    if not log.stat().st_size:
+        raise UserError(f"{log}: is empty; its first line names the columns")
     try:
         table = np.atleast_1d(np.genfromtxt(log, delimiter=",", names=True, dtype=float))
-    except ValueError as why:
-        raise UserError(f"{log}: is not a table of numbers: {why}") from None
-    names = [name for name in table.dtype.names or () if name.startswith("error")]
+    except (ValueError, IndexError) as why:
+        words = str(why).strip().splitlines()[:2]
+        raise UserError(f"{log}: is not a table of numbers: {' '.join(words)}") from None
+    names = sorted((name for name in table.dtype.names or () if name.startswith("error")),
+                   key=lambda name: int(name[5:]) if name[5:].isdigit() else 0)  # fmt: skip
+    other = next((name for name in names if name[5:] and not name[5:].isdigit()), None)
+    if other is not None:
+        raise UserError(f"{log}: column {other!r}: name it error, or error1, error2, ..., in m")
     if not names:
         raise UserError(f"{log}: has no column `error`; its first line names the columns")
     error = np.column_stack([table[name] for name in names])
@@ -174,13 +182,19 @@ def improved(
         raise UserError(f"{path}: the log has {words}")
     if len(error) * model.period < profile.duration:
         raise UserError(f"{path}: the log ends before the setpoint; record longer")
+    far, largest = float(np.abs(model.end).max()), float(np.abs(error).max())
+    if largest > far:
+        words = f"the error in the log is up to {largest:.4g} {spoken('m')}, the move {far:.4g}"
+        raise UserError(f"{path}: {words}; give the error in {spoken('m')}")
     count = min(count, len(error))
     model = replace(model, reached=model.reached[:count])
     shaped = model.shaped(shape)
     x = learned(shape.joined(np.array(before["shaper"]), F), error[:count],
                 learning_gain(shaped, shape), shape)  # fmt: skip
     rms, moves = float(np.sqrt(np.mean(error**2))), before["learned"] + 1
-    return json_values(dict(before) | {"forces": shape.split(x)[1].tolist(), "learned": moves}), [
+    new = {"forces": shape.split(x)[1].tolist(), "learned": moves} | dict.fromkeys(OF_DESIGN)
+    return json_values(dict(before) | new), [
         f"learned       from move {moves}, RMS of its error {with_unit(rms, spoken('m'))}",
+        "judged        unknown: the page and its plants judge those before",
         f"coefficients  {path}, and feedforward.c beside it",
     ]  # fmt: skip

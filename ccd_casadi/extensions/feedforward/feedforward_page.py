@@ -50,12 +50,15 @@ def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -
     lead = (
         f"A move of {moved(found)}: the latest plant of the set settles after "
         f"{in_ms(found.latest)}; with the model's inverse as feedforward, "
-        f"{in_ms(found.latest_inverse)}. No plant needs more heat or more peak force than the "
-        "inverse needs at most."
+        f"{in_ms(found.latest_inverse)}. The largest heat is "
+        f"{100.0 * found.heat / found.limits.heat:.4g} %, and the largest force "
+        f"{100.0 * found.peak / found.limits.peak:.4g} %, of what the inverse needs."
     )
     head = c.Head(
-        f"Feedforward of {run_name(run.folder)}", "good" if good else "bad",
-        "settles on the set" if good else "not verified", "" if good else f"{drawn}.",
+        f"Feedforward of {run_name(run.folder)}",
+        "bad" if not good else "good" if len(found.judged) else "warn",
+        "not verified" if not good else "settles on the set" if len(found.judged)
+        else "not judged", "" if good else f"{drawn}.",
         f"{len(found.responses)} plants of the design; {drawn}" if len(found.judged)
         else f"{len(found.responses)} plants of the design, none drawn", lead,
     )  # fmt: skip

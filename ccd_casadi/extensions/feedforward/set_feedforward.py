@@ -28,6 +28,8 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -84,7 +86,7 @@ class SetFeedforward:
     limits : ForceLimits
         What the inverse needs.
     heat, peak : float
-        The largest of the design's plants, N² s and N.
+        The largest of all plants, those that judge too, N² s and N.
     contraction : float
         ρ of `learning`, of the design's plants.
     """
@@ -184,12 +186,13 @@ def set_feedforward(
         return np.array([each.shaped(shape).settled(x, window) for each in some])
 
     shaped = [each.shaped(found.shape) for each in responses]
+    everyone = [*shaped, *(each.shaped(found.shape) for each in judges)]
     gain = learning_gain(shaped[0], found.shape)
     return SetFeedforward(
         found, x, profile, window, tuple(responses),
         times_of(responses, found.shape, found.x), times_of(responses, one, x),
         times_of(judges, found.shape, found.x), times_of(judges, one, x), limits,
-        max(each.heat(found.x) for each in shaped), max(each.peak(found.x) for each in shaped),
+        max(each.heat(found.x) for each in everyone), max(each.peak(found.x) for each in everyone),
         contraction(shaped, gain, found.shape),
     )  # fmt: skip
 
@@ -223,12 +226,24 @@ def _responses(
 def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     """Plants from the box of a run; none where it has none."""
     if not kind_of(run.problem).as_designed:
-        return []
+        return _drawn_shifts(run, count, seed)
     uncertain = uncertain_plant(run.problem, run.theta)
     if not uncertain.names and len(uncertain.options) == 1:
         return []
     points = uncertain.drawn(np.random.default_rng(seed), count)
     return [plant.plant_si() for plant in uncertain.plants(points)]
+
+
+def _drawn_shifts(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+    """Plants from the ranges of resonances and damping of a full-order run."""
+    robust, rng = run.problem.robust, np.random.default_rng(seed)
+    if robust is None:
+        return []
+    shifts = rng.uniform(-robust.shift, robust.shift, count).tolist()
+    damping = (1.0, *robust.damping)
+    factors = rng.uniform(min(damping), max(damping), count).tolist()
+    return [scale_plant(run.modal(Perturbation(*at)), run.weights.M_K).plant_si()
+            for at in zip(shifts, factors, strict=True)]  # fmt: skip
 
 
 def _shapes(run: FinishedRun, one: Shape, taps: int, options: FeedforwardSetOptions) -> list[Shape]:
