@@ -13,7 +13,7 @@ W V = 1. On examples/gantry_stroke under a random force the motion does not rise
 state by the last force alone (`controller_takeover`) raises it sixfold, as it starts all filters
 anew.
 
-The simulation moves p at a constant rate from one end to the other, the plant's matrices with it,
+The simulation moves p to and fro between the ends at a constant rate, the plant's matrices with it,
 under a random force, and compares what is left of the loop's quiet with that of p at rest:
 
     rise = max over t of |y| on the way / max over p at rest and t of |y|
@@ -154,7 +154,8 @@ def rates_tried(
     found = []
     for trial in range(options.trials):
         steps = longest // 2**trial
-        rise = largest(np.linspace(low, high, steps)) / rest
+        to_and_fro = np.abs(np.arange(longest) / steps % 2.0 - 1.0)  # as long as at rest
+        rise = largest(high - (high - low) * to_and_fro) / rest
         found.append(RateTrial((high - low) / (steps * sampling.period), rise))
         if not rise <= options.rise:
             break

@@ -74,7 +74,7 @@ def _rates(found: Schedule, unit: str) -> c.Figure:
         levels=(c.Level(CrossingOptions().rise, "allowed"),), log_x=True,
     )  # fmt: skip
     words = (
-        f"{found.name} crosses its range at a constant rate under a random force; simulated, not "
+        f"{found.name} moves to and fro at a constant rate under a random force; simulated, not "
         "proven. Forces of that motion itself are not in it."
     )
     return c.Figure(c.Lines(((panel,),), "Rates", (2.8,)), words)
