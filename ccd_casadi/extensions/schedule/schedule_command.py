@@ -24,8 +24,6 @@ from ccd_casadi.support.terminal import inform, remark, say
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Design, judge, simulate the way, write schedule.json, C code and the page."""
-    import numpy as np
-
     from ccd_casadi.cases.case import load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.drawing.paint import write_page
@@ -33,7 +31,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
         entry,
-        frozen_positions,
+        kept_at_positions,
         summary,
         write_code,
     )
@@ -59,9 +57,9 @@ def main(options: argparse.Namespace) -> ExitCode:
         segments, alone, whole = segments_of(
             problem, theta, name, tell=tell, workers=workers, options=limits
         )
-    places = np.linspace(segments[0].low, segments[-1].high, options.positions).tolist()
-    tell(f"{options.positions} positions are judged")
-    frozen = frozen_positions(problem, theta, name, segments, places)
+        segments, frozen = kept_at_positions(
+            problem, theta, name, segments, options.positions, workers=workers, tell=tell
+        )
     tell("the way over the range is simulated")
     rates = rates_tried(problem, theta, name, segments, seed=options.seed)
     found = Schedule(

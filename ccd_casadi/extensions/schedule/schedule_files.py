@@ -16,7 +16,7 @@ from ccd_casadi.extensions.schedule.handover import (
     controllers_of,
     handovers,
 )
-from ccd_casadi.extensions.schedule.segments import Alone, Segment, within
+from ccd_casadi.extensions.schedule.segments import Alone, ScheduleOptions, Segment, refined, within
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -29,6 +29,8 @@ from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, counted, template
 
 CODE = ("schedule.h", "schedule.c")
@@ -41,15 +43,20 @@ class FrozenPosition:
     Attributes
     ----------
     at : float
-    passed : bool
-        Every bound on the plants of the set there.
+    failed : tuple of int
+        Parts, from 0, that exceed a bound on a plant of the set there.
     bandwidth : float
         On the model there, the slowest of the parts, rad/s.
     """
 
     at: float
-    passed: bool
+    failed: tuple[int, ...]
     bandwidth: float
+
+    @property
+    def passed(self) -> bool:
+        """Every part that may control there keeps every bound."""
+        return not self.failed
 
 
 @dataclass(frozen=True)
@@ -126,8 +133,8 @@ def frozen_positions(
     for p in positions:
         own = uncertain_plant(within(problem, name, p, p), theta)
         plants = own.as_written(own.corners())
-        passed, bandwidth = True, np.inf
-        for one, coded in zip(segments, K, strict=True):
+        failed, bandwidth = [], np.inf
+        for i, (one, coded) in enumerate(zip(segments, K, strict=True)):
             if not one.low <= p <= one.high:
                 continue
             assert one.design.controller is not None
@@ -135,9 +142,47 @@ def frozen_positions(
                                  one.design.bandwidth, integrator)  # fmt: skip
             loop = closed_loop(sampled(plants[0], sampling.period, sampling.delay), coded)
             bandwidth = min(bandwidth, loop_figures(loop, bounds.places).bandwidth)
-            passed &= bool(judged.passed)
-        found.append(FrozenPosition(p, passed, float(bandwidth)))
+            failed += [] if judged.passed else [i]
+        found.append(FrozenPosition(p, tuple(failed), float(bandwidth)))
     return found
+
+
+def kept_at_positions(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
+    count: int, *, workers: Pool, tell: Tell = silent,
+    options: ScheduleOptions = ScheduleOptions(),
+) -> tuple[list[Segment], list[FrozenPosition]]:  # fmt: skip
+    """Judge the parts at positions; where one exceeds a bound, design it anew and judge at others.
+
+    Parameters
+    ----------
+    problem, theta, name : CoDesignProblem, sequence of float, str
+    segments : sequence of Segment
+    count : int
+        Positions, evenly over the range; after a new design between those before.
+    workers, tell : Pool, callable
+    options : ScheduleOptions
+
+    Returns
+    -------
+    list of Segment
+    list of FrozenPosition
+        Of the parts that are returned.
+    """
+    segments, places = list(segments), np.linspace(segments[0].low, segments[-1].high, count)
+    for turn in range(options.refinements + 1):
+        tell(f"{count} positions are judged")
+        found = frozen_positions(problem, theta, name, segments, places.tolist())
+        late = {i for one in found for i in one.failed}
+        if not late or turn == options.refinements:
+            break
+        for i in late:
+            own = [one.at for one in found if i in one.failed]
+            tell(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
+            segments[i] = refined(segments[i], theta, name, own, workers=workers, tell=tell)
+        between = 0.5 * (places[1:] + places[:-1])
+        places = np.concatenate([places[:1], between, places[-1:]])  # the ends are corners
+    return segments, found
 
 
 def entry(found: Schedule) -> dict[str, Any]:

@@ -19,10 +19,14 @@ from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_plant_set import (
+    structured_of,
+    uncertain_plant,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import prepared, with_range
+from ccd_casadi.inner_problem.structured_search import prepared, race, with_range
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
@@ -42,12 +46,15 @@ class ScheduleOptions:
         d, over the width of the part that is halved.
     positions : int
         At which a controller for that position alone is searched, evenly over the range.
+    refinements : int
+        Times at most that positions at which a part exceeds a bound join its design.
     """
 
     share: float = 0.9
     most: int = 8
     overlap: float = 0.05
     positions: int = 5
+    refinements: int = 3
 
 
 @dataclass(frozen=True)
@@ -254,6 +261,41 @@ def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
         inside = sorted(alone, key=lambda one: abs(one.at - middle))[:2]
     return min(part.design.bandwidth / one.bandwidth if one.bandwidth else np.inf
                for one in inside)  # fmt: skip
+
+
+def refined(
+    segment: Segment, theta: Sequence[float], name: str, positions: Sequence[float], *,
+    workers: Pool, tell: Tell = silent,
+) -> Segment:  # fmt: skip
+    """Design a part anew from its own controller, with the plants at some positions in its set.
+
+    Parameters
+    ----------
+    segment : Segment
+    theta, name : sequence of float, str
+    positions : sequence of float
+        At which it exceeds a bound.
+    workers, tell : Pool, callable
+
+    Returns
+    -------
+    Segment
+        Judged again; the same where no controller keeps the wider set.
+    """
+    own = uncertain_plant(segment.problem, theta)
+    row = np.arange(len(own.names)) == own.names.index(f"theta.{name}")
+    more = [(option, tuple(np.where(row, p, corner).tolist()))
+            for p in positions for option, corner in own.corners()]  # fmt: skip
+    known = structured_of(segment.problem).scenarios
+    problem = with_structured(
+        segment.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
+        warm_starts=(tuple(map(float, segment.design.kappa)),),
+    )  # fmt: skip
+    made = race(problem, theta, tell, workers, True)
+    if not made.certified:
+        return segment
+    part = DesignedPart(segment.low, segment.high, problem, made)
+    return _judged([part], theta, tell, workers)[0]
 
 
 def _judged(
