@@ -226,23 +226,39 @@ def test_the_code_gives_what_is_designed(tmp_path: Path) -> None:
 def test_what_is_no_log_is_refused_by_name(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     with pytest.raises(UserError, match="no such file"):
-        read_error(log)
+        read_error(log, 1.0)
     log.write_text("time,position\n0,1\n")
     with pytest.raises(UserError, match="no column `error`"):
-        read_error(log)
+        read_error(log, 1.0)
     log.write_text("time,error\n0,1e-6\n1,\n")
     with pytest.raises(UserError, match="line 3"):
-        read_error(log)
+        read_error(log, 1.0)
     log.write_text("time,error1,error2\n0,1e-6,2e-6\n1,3e-6,4e-6\n")
-    np.testing.assert_allclose(read_error(log), [[1e-6, 2e-6], [3e-6, 4e-6]])
+    np.testing.assert_allclose(read_error(log, 1.0), [[1e-6, 2e-6], [3e-6, 4e-6]])
     log.write_text("error2,error1\n2e-6,1e-6\n4e-6,3e-6\n")
-    np.testing.assert_allclose(read_error(log), [[1e-6, 2e-6], [3e-6, 4e-6]])
+    np.testing.assert_allclose(read_error(log, 1.0), [[1e-6, 2e-6], [3e-6, 4e-6]])
     log.write_text("time,error_um\n0,1\n1,2\n")
     with pytest.raises(UserError, match=r"error_um.*in m"):
-        read_error(log)
+        read_error(log, 1.0)
     log.write_text("")
     with pytest.raises(UserError, match="is empty"):
-        read_error(log)
+        read_error(log, 1.0)
+
+
+@pytest.mark.parametrize("times", [
+    np.arange(8.0) / 4000.0,  # of another rate
+    np.arange(8.0) / 8.0,  # in ms
+    np.delete(np.arange(9.0), 4) / 8000.0,  # a sample is lost
+    np.array([0.0, 1.0, np.nan]) / 8000.0,
+])  # fmt: skip
+def test_times_of_another_rate_are_refused(tmp_path: Path, times: Array) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text("time,error\n" + "".join(f"{t!r},1e-6\n" for t in times.tolist()))
+    with pytest.raises(UserError, match=r"line \d.*'time'.*0\.000125 s"):
+        read_error(log, 1.0 / 8000.0)
+    # those of the controller, from any first one on, in the digits that a log has
+    log.write_text("time,error\n" + "".join(f"{7 + i / 8000.0:.5f},1e-6\n" for i in range(8)))
+    assert read_error(log, 1.0 / 8000.0).shape == (8, 1)
 
 
 def test_what_is_learned_is_not_called_judged() -> None:

@@ -27,7 +27,7 @@ FILE = "feedforward.json"
     option("--learn", type=Path, metavar="LOG",
            help="improve the coefficients in the folder by the error of a move of the machine: "
            "CSV with a line for each sample and a column `error`, or error1, error2, ...: the "
-           "controller's error in m"),
+           "controller's error in m; a column `time` in s has to be of its samples"),
     valued("--taps", "N", integer(1, 9), "of the shaper at most; 1: none", 3),
     valued("--judges", "N", integer(1), "plants of the set that judge the design", 500),
     valued("--axis", "N", integer(1), "output that moves", 1),
@@ -94,7 +94,7 @@ def _learn(run: "FinishedRun", folder: Path, log: Path) -> ExitCode:
     from ccd_casadi.support.json_files import write_json
 
     before = read_json(folder / FILE)
-    after, words = improved(run, folder / FILE, before, read_error(log))
+    after, words = improved(run, folder / FILE, before, read_error(log, before["period"]))
     write_json(folder / FILE, after)
     write_code(folder, after)
     inform("\n".join(words))

@@ -115,10 +115,23 @@ def write_code(folder: Path, answer: Mapping[str, Any]) -> None:
         (folder / name).write_text(text, "utf-8")
 
 
-def read_error(log: Path) -> Array:
+def read_error(log: Path, period: float) -> Array:
     """The error of a move (N, q) from the columns `error`, or error1, error2, ..., of a CSV file.
 
-    Raises UserError where there is none, one has another unit, or a value is no number.
+    Parameters
+    ----------
+    log : Path
+    period : float
+        From line to line, s; a column `time` has to agree.
+
+    Returns
+    -------
+    array (N, q)
+
+    Raises
+    ------
+    UserError
+        There is no such column, one has another unit or rate, or a value is not a number.
     """
     if not log.exists():
         raise UserError(f"{log}: there is no such file; give the log of a move")
@@ -140,7 +153,20 @@ def read_error(log: Path) -> Array:
     if not np.isfinite(error).all():
         row = int(np.flatnonzero(~np.isfinite(error).all(axis=1))[0])
         raise UserError(f"{log}: line {row + 2}: the error is not a finite number")
+    if "time" in (table.dtype.names or ()):
+        _require_rate(log, table["time"], period)
     return error
+
+
+def _require_rate(log: Path, time: Array, period: float) -> None:
+    """Refuse times of another rate, or with lost samples; half a period is for their digits."""
+    wrong = ~(np.abs(time - time[0] - period * np.arange(len(time))) < 0.5 * period)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise UserError(
+            f"{log}: line {row + 2}: column 'time' is not in steps of {period:.6g} s; record every "
+            "sample of the controller, with its time in s"
+        )
 
 
 def improved(
