@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
@@ -65,6 +66,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment import source_code
     from ccd_casadi.deployment.deploy_files import DESIGN_FILES, write_files
     from ccd_casadi.deployment.fixed_point import FixedRequest
+    from ccd_casadi.deployment.integer_words import integer_faults
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
@@ -121,6 +123,7 @@ def main(options: argparse.Namespace) -> ExitCode:
                 ports=finished.loop.ports if finished.loop.ported else None,
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
+    found = replace(found, integer_faults=integer_faults(found.rounding, moved))
     # an earlier controller must not pass for this one
     formats = source_code.ST_FILE, source_code.XML_FILE, source_code.FMU_FILE
     for name in (*DESIGN_FILES, *source_code.C_FILES, *formats):

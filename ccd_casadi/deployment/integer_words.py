@@ -68,7 +68,8 @@ def integer_faults(rounding: RoundingBound | None, moved: OnHardware | None) -> 
     parts = []
     if not rounding.largest <= moved.window:
         window = with_unit(moved.window, spoken("m"))
-        parts.append(f"{rounding_words(rounding)}, and a move has to end within {window}")
+        beyond = f", beyond its window, {window}" if isfinite(rounding.largest) else ""
+        parts.append(f"{rounding_words(rounding)}{beyond}")
     full = [name for name, move in moved.ways.items() if name in UNLIMITED and move.saturated]
     if full:
         parts.append(f"a move saturates words of {rounding.bits} bits ({full[0]})")

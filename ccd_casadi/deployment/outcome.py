@@ -11,7 +11,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.integer_loop import RoundingBound
-from ccd_casadi.deployment.integer_words import integer_faults, rounding_words
+from ccd_casadi.deployment.integer_words import rounding_words
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import LoopChannel, Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
@@ -86,6 +86,8 @@ class Deployment:
         How the loop was designed to run; None where K(s) was designed.
     rounding : RoundingBound or None
         What integers add on the worst plant; None of floating point, and of an unstable loop.
+    integer_faults : tuple of str
+        What integers may spoil of the move; empty: nothing.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -108,6 +110,7 @@ class Deployment:
     judge: Judgement | None = None
     designed: Sampling | None = None
     rounding: RoundingBound | None = None
+    integer_faults: tuple[str, ...] = ()
 
     @property
     def order(self) -> int:
@@ -141,7 +144,7 @@ class Deployment:
                 words.append(f"compliance |GS| in m/N {missed} ({place_words(at)})")
         if self.judge is not None and not self.judge.passed:
             words.append(f"the plant as its function returned it: {self.judge.words}")
-        return tuple(words)
+        return (*words, *self.integer_faults)
 
     @property
     def levels(self) -> tuple[str, ...]:
@@ -250,10 +253,8 @@ def deployed_line(
                 f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
             )
     ends = limit_words(figures["move"] or {})
-    integers = integer_faults(found.rounding, moved)
-    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends,
-                              *integers))]  # fmt: skip
-    if found.rounding is not None and not integers:
+    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends))]
+    if found.rounding is not None:
         kept.append(rounding_words(found.rounding))
     if reasons:
         return VerdictLine.of(State.WARNED, (*reasons, *kept), figures)

@@ -53,8 +53,11 @@ def require(package: str, extra: str) -> Any:
     MissingPackage
         It, or a library of the system that it loads, is not installed.
     """
+    import numpy as np  # a command that needs no extra starts without
+
     try:
-        return import_module(package)
+        with np.printoptions():  # pyyeti changes how every number of the program is written
+            return import_module(package)
     except ImportError:
         words = f"is not installed; install it with pip install 'ccd-casadi[{extra}]'"
         raise MissingPackage(f"{package}: {words}") from None

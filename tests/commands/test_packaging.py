@@ -18,7 +18,7 @@ from ccd_casadi.support import options
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # what is imported has another name than what is declared, and need not be installed here
-NAMES = {"skfem": "scikit-fem", "sklearn": "scikit-learn"}
+NAMES = {"ansys": "ansys-mapdl-reader", "skfem": "scikit-fem", "sklearn": "scikit-learn"}
 
 
 def normal(requirement: str) -> str:

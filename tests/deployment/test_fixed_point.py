@@ -183,8 +183,10 @@ def test_the_command_leaves_integers_and_their_verdict(
     line = json.loads((run / "result.json").read_text())["verdict"]["deployable"]
     found = json.loads((run / "deploy" / "deploy.json").read_text())["rounding"]
     assert 0.0 < line["rounding"] == found["errors"][0] < 1e-6
-    assert deploy_main([str(run), "--fixed", "16", "--window", "1e-9", "--quiet"]) == 0
+    # integers that may spoil the move are not verified
+    assert deploy_main([str(run), "--fixed", "16", "--window", "1e-9", "--quiet"]) == 4
+    assert "NOT verified" in (run / "deploy" / "controller.h").read_text()
     line = json.loads((run / "result.json").read_text())["verdict"]["deployable"]
-    assert line["state"] == "warned"
-    assert "a move has to end within 1 nm" in " ".join([line["words"], *line.get("details", [])])
+    assert line["state"] == "failed"
+    assert "beyond its window, 1 nm" in " ".join([line["words"], *line.get("details", [])])
     assert deploy_main([str(run), "--fixed", "16", "--single", "--quiet"]) == 2

@@ -343,7 +343,7 @@ def test_every_page_of_a_run(browser, examined):
     linked = [link for link in linked if link.endswith(".html")]  # data stand beside the pages
     pages = sorted(folder.rglob("*.html"))
     assert sorted([*linked, (folder / "index.html").as_uri()]) == [p.as_uri() for p in pages]
-    assert len(pages) == 7
+    assert len(pages) == 8
     looked_at(browser, [place for place in pages if place.stem != "brief"])
 
 

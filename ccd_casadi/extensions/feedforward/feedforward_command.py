@@ -59,6 +59,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     outputs = len(run.plant.C)
     if options.axis > outputs:
         raise UserError(f"--axis: is {options.axis}; the plant has outputs 1 to {outputs}")
+    if options.axis > 1 and run.loop.at:
+        words = "of several sensors on one actuator the one whose error counts moves; leave it out"
+        raise UserError(f"--axis: is {options.axis}; {words}")
     folder = run_folder(options.run, options.out or options.run / "feedforward")
     own = profile_of(run) if options.axis == 1 else None
     profile, window = own or (setpoint(move_limits(options)), options.window)
