@@ -64,13 +64,14 @@ def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -
     )  # fmt: skip
     h, F = found.found.shape.split(found.found.x)
     rows = [
-        (f"{1e3 * i * found.found.shape.spacing * found.responses[0].period:.4g}", f"{h[i]:.5g}",
-         *(", ".join(f"{value:.5g}" for value in F[i, j]) for j in found.found.shape.orders))
+        (1e3 * i * found.found.shape.spacing * found.responses[0].period, float(h[i]),
+         *(float(value) for j in found.found.shape.orders for value in F[i, j]))
         for i in range(len(h))
     ]  # fmt: skip
     names = {0: "position (N/m)", 1: "velocity (N s/m)", 2: "acceleration (kg)",
              3: "jerk (kg s)", 4: "snap (kg s²)"}  # fmt: skip
-    per = (spoken(f"per {names[j]}") for j in found.found.shape.orders)
+    motors = [f", motor {k}" for k in range(1, F.shape[2] + 1)] if F.shape[2] > 1 else [""]
+    per = (spoken(f"per {names[j]}{motor}") for j in found.found.shape.orders for motor in motors)
     table = c.Table(("delay (ms)", "of the setpoint (–)", *per), tuple(rows))
     return c.Page(head, (
         c.Chapter("The move on every plant", (_errors(found),)),
