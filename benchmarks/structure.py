@@ -6,8 +6,9 @@ Counts by the syntax tree alone, of the two packages and of each folder that is 
 scikit-fem, optimistix, pyMOR, python-control, ...). A *bare constant* is an upper-case name of a
 module that is bound to numbers; *of algorithms*, counted of ours alone, is one that is neither of
 drawing nor in `EXEMPT` (physics, units, indices). *Used across rooms*: public functions and classes
-that another package folder imports; documented is one whose docstring has a section of NumPy's
-(Parameters, Returns, Attributes, Raises).
+that another package folder imports, but exceptions, enumerations and tables of a case file, whose keys
+say what they mean; documented is one whose docstring has a section of NumPy's (Parameters, Returns,
+Attributes, Raises). A function that takes and returns nothing needs a sentence alone.
 """
 
 import ast
@@ -150,6 +151,16 @@ def across_rooms(modules: list[Tree]) -> set[tuple[str, str]]:
     }  # fmt: skip
 
 
+def says_itself(node: Definition) -> bool:
+    """Whether a sentence is all that there is to say: of what has no parts, or parts with words."""
+    if isinstance(node, ast.FunctionDef):
+        return not node.args.args and ast.unparse(node.returns or ast.Name("")) == "None"
+    bases = " ".join(map(ast.unparse, node.bases))
+    fields = [ast.unparse(n.value) for n in node.body if isinstance(n, ast.AnnAssign) and n.value]
+    tables = bool(fields) and all(value.startswith("key(") for value in fields)
+    return tables or any(word in bases for word in ("Enum", "Exception", "Error"))
+
+
 def counted(folders: list[Path]) -> dict[str, str]:
     """What the table says of these folders."""
     modules = trees(folders)
@@ -171,7 +182,8 @@ def counted(folders: list[Path]) -> dict[str, str]:
         for path, tree, _ in modules
         for node in tree.body
         if isinstance(node, Definition) and node.name in rooms.get(path.stem, ())
-    ]
+        and not says_itself(node)
+    ]  # fmt: skip
     documented = [n for n in public if any(s in (ast.get_docstring(n) or "") for s in SECTIONS)]
     classes = Counter(
         n.name for _, tree, _ in modules for n in tree.body if isinstance(n, ast.ClassDef)

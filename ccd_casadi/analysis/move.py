@@ -333,10 +333,23 @@ def _switch(
 
 
 def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
-    """r and four derivatives (5, N) as a controller that holds them for a period takes them.
+    """Sample r and four derivatives as a controller that holds them for a period takes them.
 
-    Of each derivative the mean over a period about the instant: a snap that jumps between two
-    instants is felt in its share.
+    Of each derivative the mean over a period about the instant, (r^(i-1)(t + T/2) -
+    r^(i-1)(t - T/2))/T: a snap that jumps between two instants is felt in its share.
+
+    Parameters
+    ----------
+    profile : Setpoint
+    time : array (N,)
+        s.
+    period : float
+        T in s.
+
+    Returns
+    -------
+    array (5, N)
+        r in m and its derivatives in m/s^i.
     """
     r, half = profile.at(time), 0.5 * period
     r[1:] = (profile.at(time + half)[:4] - profile.at(time - half)[:4]) / period

@@ -14,14 +14,32 @@ class YieldOptions:
 
 
 def yield_bound(survived: int, draws: int, confidence: float = YieldOptions().confidence) -> float:
-    """The least share of all plants that survive, by independent draws: exact for the binomial.
+    """Bound from below the share of all plants that survive, by independent draws.
 
-    The q with P(at least `survived` of `draws` | q) = 1 - confidence (Clopper and Pearson 1934):
+    It is exact for the binomial: the q with P(at least `survived` of `draws` | q) = 1 - confidence
+    (Clopper and Pearson 1934):
 
         I_q(survived, draws - survived + 1) = 1 - confidence
 
     Of none that fails it is (1 - confidence)^(1/draws). The draws must not have been chosen, and
     the design must not have been changed by them.
+
+    Parameters
+    ----------
+    survived, draws : int
+        Of independent draws.
+    confidence : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    float
+        q from 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        A count or the confidence is out of range.
 
     >>> round(yield_bound(13_809, 13_809), 5), round(yield_bound(199, 200, 0.95), 4)
     (0.999, 0.9765)

@@ -234,8 +234,10 @@ class LoopTable:
 
 @dataclass(frozen=True)
 class DriveTable:
-    """[drive]: the industrial drive that `ccd drive` designs a cascade for; other commands refuse
-    a case that has one."""
+    """[drive]: the industrial drive that `ccd drive` designs a cascade for.
+
+    Other commands refuse a case that has one.
+    """
 
     name: str | None = key(
         "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file like theirs (.toml)", None

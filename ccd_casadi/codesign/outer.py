@@ -304,10 +304,27 @@ def pieces_from(
     ends: Sequence[Place] = (),
     options: ThetaDescentOptions = ThetaDescentOptions(),
 ) -> InnerSample:
-    """From a sample to where the pieces of J promise no more, or near a stationary point of `ends`,
-    with what is known near by.
+    """Descend J from a sample by its pieces, with what is known near by.
 
-    Again from the best where a better controller was found on the way for what had been known.
+    It ends where the pieces promise no more, or near a stationary point of `ends`, and begins again
+    from the best where a better controller was found on the way for what had been known.
+
+    Parameters
+    ----------
+    sampler, best : Sampler, InnerSample
+        The first θ, solved.
+    settled : float
+        Gain of J that the pieces may still promise at the end, relative.
+    first : float
+        First radius of a step, as a share of the box.
+    ends : sequence of Place
+        Where other descents ended.
+    options : ThetaDescentOptions
+
+    Returns
+    -------
+    InnerSample
+        The best θ on the way.
     """
     problem, asked = sampler.problem, [best]
     bounds = box(problem)

@@ -342,7 +342,17 @@ def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, A
 
 
 def proof_dict(proof: "Proof") -> dict[str, Any]:
-    """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
+    """Write the entry `proof`: what holds on the whole box.
+
+    Parameters
+    ----------
+    proof : Proof
+
+    Returns
+    -------
+    dict
+        `levels` are figures over their bounds by kind; a refuted proof names the plant.
+    """
     found: dict[str, Any] = {
         "outcome": proof.outcome.name.lower(),
         "words": proof.words,

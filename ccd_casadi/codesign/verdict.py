@@ -146,7 +146,18 @@ def split(
 
 
 def clauses_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """The clauses of a line as result.json has it; none of an empty entry."""
+    """Read the clauses of a line of the verdict.
+
+    Parameters
+    ----------
+    entry : mapping
+        As result.json has it; may be empty.
+
+    Returns
+    -------
+    tuple of str
+        The line's words, then its details.
+    """
     return (str(entry.get("words", "")), *map(str, entry.get("details", ())))
 
 

@@ -172,8 +172,17 @@ class FixedPoint:
 
 @dataclass(frozen=True)
 class FixedRequest:
-    """Words of how many bits, the steps of a count of sensor and force (0: chosen by the range),
-    and the moves that have to fit the range."""
+    """What is required of integers.
+
+    Attributes
+    ----------
+    bits : int
+        Of a word.
+    moves : MoveLimits
+        Moves that have to fit the range.
+    sensor_step, force_step : float
+        Of a count, m and N; 0: chosen by the range.
+    """
 
     bits: int
     moves: MoveLimits

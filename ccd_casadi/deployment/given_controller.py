@@ -105,8 +105,25 @@ def _measured(run: FinishedRun) -> FinishedRun:
 
 
 def read_controller(path: Path) -> tuple[StateSpace, float]:
-    """The controller in a .json, .toml or .mat file, SI, e = r - y to u, and of a discrete one the
-    delay in s from reading y to the new u. Raises UserError where there is none."""
+    """Read a controller from a file.
+
+    Parameters
+    ----------
+    path : Path
+        A .json, .toml or .mat file: matrices, sections, or a system.
+
+    Returns
+    -------
+    StateSpace
+        From e = r - y in m to u in N.
+    float
+        The delay in s from reading y to the new u; 0 of a continuous controller.
+
+    Raises
+    ------
+    UserError
+        The file has no controller, or one with a delay in it.
+    """
     if path.suffix not in (".json", ".toml", ".mat"):
         raise UserError(f"{path}: name a controller as .json, .toml or .mat")
     if not path.exists():

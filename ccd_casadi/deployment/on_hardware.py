@@ -197,8 +197,23 @@ def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, b
 def forward_of(
     plant: StateSpace, period: float, delay: float, places: Sequence[BreakPoint]
 ) -> Array:
-    """`feedforward`; of several sensors on one actuator of the output that counts, in the column of
-    each sensor its share in that."""
+    """Compute `feedforward` of a plant that may have several sensors on its actuator.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        SI.
+    period, delay : float
+        s.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator; else empty.
+
+    Returns
+    -------
+    array (5, m)
+        F of `feedforward`; of several sensors (5, p) of the output that counts, in the column of
+        each sensor its share in that.
+    """
     if not places:
         return feedforward(plant, period, delay)
     row = np.array([places[0].output])

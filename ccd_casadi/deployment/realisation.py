@@ -112,12 +112,23 @@ def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace])
 
 @dataclass(frozen=True)
 class Realisation:
-    """x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k in SI; A block-diagonal with these `blocks`.
+    """A controller x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k as its code computes it.
 
-    With a `saturation` in N every u is clipped to ± it, and the states are corrected by what was
-    cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`). `single`: the code
-    computes with numbers of 24 bits, and the coefficients are such (`in_single`). `fixed`: it
-    computes with these integers, and the coefficients are theirs (`fixed_point.in_fixed`).
+    Attributes
+    ----------
+    system : StateSpace
+        SI; A is block-diagonal.
+    blocks : tuple of int
+        Sizes of the blocks.
+    saturation : float or None
+        N: every u is clipped to ± it, and the states are corrected by what was cut off,
+        + L (u_k - v_k).
+    back_calculation : array (n, m) or None
+        L (`anti_windup`).
+    single : bool
+        The code computes with numbers of 24 bits, and the coefficients are such (`in_single`).
+    fixed : FixedPoint or None
+        It computes with these integers, and the coefficients are theirs (`fixed_point.in_fixed`).
     """
 
     system: StateSpace
@@ -316,7 +327,16 @@ def dot(gains: Sequence[float], values: Sequence[float], total: float = 0.0) -> 
 
 
 def literal(value: float) -> str:
-    """17 digits give every double back; a point before the exponent, as IEC's literals want it.
+    """Write a number as a literal that C and IEC 61131 read back exactly.
+
+    Parameters
+    ----------
+    value : float
+
+    Returns
+    -------
+    str
+        Of 17 digits, with a point before the exponent, as IEC wants it.
 
     >>> literal(1e-5), literal(3.0), literal(0.1)
     ('1.0000000000000001e-05', '3.0', '0.10000000000000001')
@@ -326,7 +346,18 @@ def literal(value: float) -> str:
 
 
 def literals(values: Array, indent: int) -> str:
-    """Four in a line, the lines after the first indented."""
+    """Write numbers as literals, four in a line.
+
+    Parameters
+    ----------
+    values : array
+    indent : int
+        Spaces before every line but the first.
+
+    Returns
+    -------
+    str
+    """
     texts = [literal(value) for value in np.ravel(values)] or ["0.0"]
     lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
     return (",\n" + " " * indent).join(lines)

@@ -89,9 +89,18 @@ def place_words(at: Perturbation) -> str:
 
 
 def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
-    """Every plant of the set but the nominal one; empty without a set.
+    """List the plants of a run's set but the nominal one.
 
-    `dense`: on the number of shifts that a design is verified on.
+    Parameters
+    ----------
+    run : FinishedRun
+    dense : bool
+        On the number of shifts that a design is verified on.
+
+    Returns
+    -------
+    tuple of Member
+        Empty without a set.
     """
     if kind_of(run.problem).as_designed:
         return _of_structured(run, dense)

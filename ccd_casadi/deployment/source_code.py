@@ -104,7 +104,24 @@ def _fixed_files(realisation: Realisation, values: Mapping[str, Any]) -> Mapping
 def values_of(
     realisation: Realisation, title: str, delay: float, verified: bool, kind: str
 ) -> dict[str, Any]:
-    """What every language needs of a controller, by the names of the templates."""
+    """Collect what every language needs of a controller.
+
+    Parameters
+    ----------
+    realisation : Realisation
+    title : str
+    delay : float
+        s.
+    verified : bool
+        Whether the run is.
+    kind : str
+        Of the controller, in words.
+
+    Returns
+    -------
+    dict
+        By the names of the templates.
+    """
     K = realisation.system
     return {
         "title": plain_title(title), "kind": kind, "verified": verified,

@@ -33,8 +33,24 @@ LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a 
 
 
 def panel_html(panel: Panel, beside: int, height: float, key: str, title: str) -> str:
-    """A panel of a row of `beside` ones as a picture, height in inches; `key` is unique in the
-    page."""
+    """Draw a panel as inline SVG.
+
+    Parameters
+    ----------
+    panel : Panel
+    beside : int
+        Panels in its row.
+    height : float
+        Inches.
+    key : str
+        Unique in the page.
+    title : str
+        Read out before the panel's own.
+
+    Returns
+    -------
+    str
+    """
 
     def picture(own: str, inches: float) -> str:
         with style():

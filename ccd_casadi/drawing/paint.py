@@ -157,9 +157,18 @@ def escape(text: object) -> str:
 
 
 def typeset(text: str) -> str:
-    """Words that a terminal shows in ASCII, with the signs that are meant; units keep their number.
+    """Set words that a terminal shows in ASCII with the signs that are meant.
 
-    >>> typeset("less than +-2 %, norm <= 3, 41 um").replace("\xa0", "~")
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+        Units keep their number on one line.
+
+    >>> typeset("less than +-2 %, norm <= 3, 41 um").replace(" ", "~")
     'less than ±2~%, norm ≤ 3, 41~µm'
     >>> typeset("KKT residual 1.5e-16, at confidence 1 - 1e-6")
     'KKT residual 1.5·10⁻¹⁶, at confidence 1 - 10⁻⁶'

@@ -122,7 +122,16 @@ SHAPES = {"svg", "g", "path", "rect", "circle", "line", "polyline", "polygon", "
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Our style while a figure is built and written, and the caller's again after it."""
+    """Draw in our style within the block, and in the caller's again after it.
+
+    Yields
+    ------
+    None
+
+    Returns
+    -------
+    context manager
+    """
     import matplotlib
 
     with matplotlib.rc_context(_sheet()), warnings.catch_warnings():
@@ -141,7 +150,17 @@ def _sheet() -> Any:
 
 
 def new_figure(height: float, width: float = WIDTH) -> "Figure":
-    """An empty figure, size in inches."""
+    """Make an empty figure.
+
+    Parameters
+    ----------
+    height, width : float
+        Inches.
+
+    Returns
+    -------
+    Figure
+    """
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
@@ -157,7 +176,18 @@ def at_both_widths(draw: Callable[[str, float], str], key: str, width: float) ->
 
 
 def place(figure: "Figure", left: float, bottom: float, width: float, height: float) -> "Axes":
-    """Axes at a place given in inches: fixed margins cost a tenth of arranging them to the text."""
+    """Add axes with fixed margins, which cost a tenth of arranging them to the text.
+
+    Parameters
+    ----------
+    figure : Figure
+    left, bottom, width, height : float
+        Inches.
+
+    Returns
+    -------
+    Axes
+    """
     w, h = figure.get_size_inches()
     return figure.add_axes((left / w, bottom / h, width / w, height / h))
 
@@ -240,7 +270,15 @@ def short_label(text: str) -> str:
 
 
 def log_axis(axis: Any, low: float, high: float) -> None:
-    """A logarithmic axis from low to high (`axes.xaxis` or `.yaxis`), its labels plain text."""
+    """Make an axis logarithmic, its labels plain text.
+
+    Parameters
+    ----------
+    axis : Axis
+        `axes.xaxis` or `axes.yaxis`.
+    low, high : float
+        Its ends, above 0.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     name = axis.axis_name

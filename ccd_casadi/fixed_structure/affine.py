@@ -113,7 +113,19 @@ def product(how: str, f: Affine, g: Affine) -> Affine:
 
 
 def variable(low: Array, high: Array, index: int, variables: int) -> Affine:
-    """The variable `index` itself, between its ends."""
+    """Make the form of a variable itself, c + h t with |t| <= 1, between its ends.
+
+    Parameters
+    ----------
+    low, high : array (N,)
+        Ends on N boxes.
+    index, variables : int
+        Which of how many variables it is.
+
+    Returns
+    -------
+    Affine
+    """
     centre = 0.5 * (low + high)
     half = np.maximum(high - centre, centre - low)
     slope = np.zeros((variables, len(low)))
@@ -122,7 +134,18 @@ def variable(low: Array, high: Array, index: int, variables: int) -> Affine:
 
 
 def inverse(f: Affine) -> Affine:
-    """1/f; 1/(c + δ) = 1/c - δ/c² + δ²/(c²(c + δ))."""
+    """Invert a form: 1/(c + δ) = 1/c - δ/c² + δ²/(c²(c + δ)).
+
+    Parameters
+    ----------
+    f : Affine
+        c + δ.
+
+    Returns
+    -------
+    Affine
+        Its rest is infinite where f may be 0.
+    """
     size, low = f.middle, f.lowest
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = 1.0 / f.centre
@@ -136,7 +159,17 @@ def inverse(f: Affine) -> Affine:
 
 
 def exponential(f: Affine) -> Affine:
-    """e^f; |e^δ - 1 - δ| <= |δ|²/2 e^|δ|."""
+    """Exponentiate a form: |e^δ - 1 - δ| <= |δ|²/2 e^|δ|.
+
+    Parameters
+    ----------
+    f : Affine
+        c + δ.
+
+    Returns
+    -------
+    Affine
+    """
     value = np.exp(f.centre)
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = f.reach + f.rest

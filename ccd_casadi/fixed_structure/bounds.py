@@ -65,8 +65,17 @@ def key_words(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelPeaks:
-    """What is held against a channel's own bounds: the largest values of its row of S, uᵀS, and of
-    KS with its own M_K over frequency (rad/s), and its bandwidth; NaN where unknown."""
+    """What is held against a channel's own bounds; NaN where unknown.
+
+    Attributes
+    ----------
+    S_peak, S_peak_frequency : float
+        The largest value of its row of S, uᵀS, over frequency, and where, rad/s.
+    bandwidth : float
+        rad/s.
+    weighted_KS : float
+        The largest value of KS with its own M_K.
+    """
 
     S_peak: float = nan
     S_peak_frequency: float = nan
@@ -76,7 +85,17 @@ class ChannelPeaks:
 
 @dataclass(frozen=True, kw_only=True)
 class LoopPeaks(ChannelPeaks):
-    """The same of a whole loop, largest singular values: KS in N/m, GS in m/N, S at ω_low."""
+    """The same of a whole loop: largest singular values.
+
+    Attributes
+    ----------
+    S_low : float
+        S at ω_low.
+    KS, T, GS : float
+        Peaks, in N/m, without unit, in m/N.
+    weighted_T : float
+        T over the bound that the weight gives.
+    """
 
     S_low: float = nan
     KS: float = nan

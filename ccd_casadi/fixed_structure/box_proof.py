@@ -375,8 +375,27 @@ def divide(
     families: list[LoopFamily], box: Array, slack: float, share: int, workers: Pool | None = None,
     enough: int | None = None, options: BoxProofOptions = BoxProofOptions(),
 ) -> Proof:  # fmt: skip
-    """Branch and bound of every option's loops, each stable at one point of `box` (2, n): `share`
-    boxes of each, or `enough` where many of these are still open then."""
+    """Prove bounds on a box by branch and bound over every option's loops.
+
+    Parameters
+    ----------
+    families : list of LoopFamily
+        One of each option, its loop stable at one point of `box`.
+    box : array (2, n)
+        Ends of the uncertain parameters.
+    slack : float
+        Relative; by how much a bound may be exceeded in what is proven.
+    share : int
+        Boxes of each option, at most.
+    workers : Pool or None
+    enough : int or None
+        Boxes after which a proof without a prospect ends.
+    options : BoxProofOptions
+
+    Returns
+    -------
+    Proof
+    """
     enough = share if enough is None else enough
     first = sorted(range(len(families)), key=lambda option: -len(families[option].plant.omega))
     tasks = {option: (families[option], box, slack, share, enough, options) for option in first}

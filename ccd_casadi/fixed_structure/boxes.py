@@ -33,7 +33,15 @@ class Chart(IntEnum):
 
 @dataclass(frozen=True)
 class Boxes:
-    """N boxes: chart (N,), ends (1 + n_p, N) of the frequency coordinate and the parameters."""
+    """N boxes over a frequency coordinate and the parameters.
+
+    Attributes
+    ----------
+    chart : array (N,)
+        Which coordinate of frequency (`Chart`).
+    low, high : array (1 + n_p, N)
+        Ends.
+    """
 
     chart: np.ndarray
     low: Array

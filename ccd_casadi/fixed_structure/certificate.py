@@ -119,7 +119,21 @@ class PlantFigures(LoopPeaks):
 
 @dataclass(frozen=True)
 class SetCertificate:
-    """What the judge found on every plant, and whether all bounds hold with `bandwidth` (rad/s)."""
+    """What the judge found on every plant.
+
+    Attributes
+    ----------
+    passed : bool
+        Whether all bounds hold.
+    bandwidth : float
+        The least, rad/s.
+    plants : tuple of PlantFigures
+    worst : dict
+        The largest figure over its bound, by name.
+    words : str
+    grid_only : tuple of str
+        Names of `worst` that no level test is of.
+    """
 
     passed: bool
     bandwidth: float

@@ -20,7 +20,15 @@ from ccd_casadi.support.errors import PlantError
 
 @dataclass(frozen=True)
 class Decoupling:
-    """Names of the channels and their unit directions U (p, c) of outputs, V (m, c) of inputs."""
+    """Channels of a plant with p outputs and m inputs.
+
+    Attributes
+    ----------
+    names : tuple of str
+        c channels.
+    outputs, inputs : array (p, c), (m, c)
+        Unit directions U and V.
+    """
 
     names: tuple[str, ...]
     outputs: Array
@@ -82,11 +90,26 @@ def find_decoupling(plant: ScaledPlant, *, least_gain: float = 1e-9) -> Decoupli
 def given_decoupling(
     names: Sequence[str], outputs: Sequence[Sequence[float]], inputs: Sequence[Sequence[float]]
 ) -> Decoupling:
-    """The channels that a case gives by directions, which are brought to length 1.
+    """Make the channels that a case gives by directions, which are brought to length 1.
 
     There may be fewer outputs than channels (several actuators on one sensor: `[[1], [1]]`), or one
-    input for all channels (several sensors on one actuator: `[[1], [1]]` again). Raises PlantError
-    where directions are zero, not of one length, or do not span all outputs and inputs.
+    input for all channels (several sensors on one actuator: `[[1], [1]]` again).
+
+    Parameters
+    ----------
+    names : sequence of str
+        c channels.
+    outputs, inputs : sequence of sequences of float
+        c directions of p and of m entries.
+
+    Returns
+    -------
+    Decoupling
+
+    Raises
+    ------
+    PlantError
+        Directions are zero, not of one length, or do not span all outputs and inputs.
     """
     found = []
     for word, rows in (("outputs", outputs), ("inputs", inputs)):

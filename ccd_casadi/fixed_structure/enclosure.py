@@ -39,10 +39,17 @@ class EnclosureOptions:
 
 @dataclass(frozen=True)
 class Enclosures:
-    """Per bound (M, N): the figure over its bound lies between `lowest` and `highest` on a box.
+    """Figures over their bounds on N boxes, between `lowest` and `highest`.
 
-    `spread` (1 + n_p, N) says how much each coordinate moves the loop over the box. `bounded`
-    where the loop has no pole on the axis and the plant none right of it.
+    Attributes
+    ----------
+    names : tuple of str
+        M bounds.
+    highest, lowest : array (M, N)
+    spread : array (1 + n_p, N)
+        How much each coordinate moves the loop over the box.
+    bounded : array (N,) of bool
+        Where the loop has no pole on the axis and the plant none right of it.
     """
 
     names: tuple[str, ...]
@@ -210,11 +217,25 @@ class LoopDiscs:
 
 @dataclass(frozen=True)
 class LoopFamily:
-    """One option's loops with one controller over the box of `names`; time in 1/`unit`.
+    """One option's loops with one controller over a box of parameters; time in 1/`unit`.
 
-    `parts`: structure and κ of each channel, `outputs` (p, p) and `inputs` (m, p) their directions.
-    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s.
-    `low_pass`: the poles, in that time, of what actuators and sensors do to every channel.
+    Attributes
+    ----------
+    plant : ModalSum
+    names : tuple of str
+        Of the parameters.
+    parts : tuple of (Structure, array (n,))
+        Structure and κ of each channel.
+    outputs, inputs : array (p, p), (m, p)
+        The channels' directions.
+    bounds, bandwidth : Bounds, float
+        rad/s.
+    unit : float
+        rad/s; `plant`, κ, `period` and `delay` are in time of 1/`unit`, gains in N/m.
+    period, delay : float or None, float
+    low_pass : tuple of complex
+        The poles, in that time, of what actuators and sensors do to every channel.
+    options : EnclosureOptions
     """
 
     plant: ModalSum

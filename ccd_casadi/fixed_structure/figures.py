@@ -243,7 +243,21 @@ def assess(
 
 @singledispatch
 def constraints(problem: LoopProblem, kappa: Array, tau: float, at: RowPlaces) -> Constraints:
-    """Values and derivatives of these rows."""
+    """Compute values and derivatives of constraints.
+
+    Parameters
+    ----------
+    problem : LoopProblem
+    kappa : array (n,)
+    tau : float
+        ln ω_b in the problem's units.
+    at : RowPlaces
+        M of them.
+
+    Returns
+    -------
+    Constraints
+    """
     value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, at)
     to_tau = problem.to_tau(at, tau)
     end = at.curve == LoopCurve.CROSSING

@@ -82,9 +82,22 @@ class Ascent:
 
 
 class LoopModel(TrustRegionModel[Assessment]):
-    """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient.
+    """The bounds of a set of loops as rows over x = (κ, τ).
 
-    `known`: x where searches have been; another one ends when it comes there.
+    Parameters
+    ----------
+    problem : LoopProblem
+    goal : callable or None
+        v(κ) and its gradient; None: none.
+    reward : float
+        Of τ in the objective.
+    floor : float
+        The least τ.
+
+    Attributes
+    ----------
+    known : list of array
+        x where searches have been; another one ends when it comes there.
     """
 
     corrected = True
@@ -221,9 +234,24 @@ def descend(
     model: TrustRegionModel[Data], start: Iterate[Data], H: Array, within: float,
     options: DescentOptions = DescentOptions(),
 ) -> tuple[Iterate[Data], int]:  # fmt: skip
-    """From a stable start to where steps help no longer, and how many loops were assessed.
+    """Descend from a stable start to where steps help no longer, with rising penalties.
 
-    `within`: a violation that needs no larger penalty. H (n + 1, n + 1): the first of v.
+    Parameters
+    ----------
+    model : TrustRegionModel
+    start : Iterate
+    H : array (n + 1, n + 1)
+        The first of v.
+    within : float
+        A violation that needs no larger penalty.
+    options : DescentOptions
+
+    Returns
+    -------
+    Iterate
+        Its end.
+    int
+        How many loops were assessed.
     """
     end, evaluations = start, 0
     for penalty in options.penalties:

@@ -272,7 +272,12 @@ class LoopProblem:
 
 @dataclass(frozen=True)
 class Problem(LoopProblem):
-    """That of one channel."""
+    """The problem of one channel.
+
+    Attributes
+    ----------
+    structure : Structure
+    """
 
     structure: Structure
 
@@ -292,7 +297,15 @@ class Columns:
 
 @dataclass(frozen=True)
 class RowPlaces(Columns):
-    """LoopCurve, plant and v (over ω₀) of M constraints."""
+    """Places of M constraints.
+
+    Attributes
+    ----------
+    curve, plant : array (M,)
+        LoopCurve, and number of the plant.
+    v : array (M,)
+        Frequency over ω₀.
+    """
 
     curve: np.ndarray
     plant: np.ndarray

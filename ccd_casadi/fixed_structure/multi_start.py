@@ -109,7 +109,17 @@ class MultiStartOptions:
 
 @dataclass(frozen=True)
 class BandwidthOptimum:
-    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached, with one κ."""
+    """A bandwidth that searches reached.
+
+    Attributes
+    ----------
+    bandwidth : float
+        rad/s.
+    count : int
+        Searches that ran to the end and reached it.
+    kappa : tuple of float
+        One controller with it.
+    """
 
     bandwidth: float
     count: int
@@ -144,11 +154,28 @@ def run_race(
     last: bool = True,
     options: MultiStartOptions = MultiStartOptions(),
 ) -> list[SearchRun]:
-    """All searches from the starts `pool` (N, n), the best first.
+    """Run searches from many starts; by and by the worse half ends.
 
-    The first `known` of these are controllers that searches have ended with. Those of searches
-    `before` are in the field too and have to be overtaken. Where another multi-start search follows
-    (not `last`), one that runs alone and gains little is left to it.
+    Parameters
+    ----------
+    problem : LoopProblem
+    pool : array (N, n)
+        Starts; the first `known` are controllers that searches have ended with.
+    tell : callable
+        Of words, the progress.
+    workers : Pool or None
+    before : sequence of SearchRun
+        Searches of before, which are in the field too and have to be overtaken.
+    known : int
+    last : bool
+        Whether no multi-start search follows; else one that runs alone and gains little is left
+        to it.
+    options : MultiStartOptions
+
+    Returns
+    -------
+    list of SearchRun
+        The best first.
     """
     field = list(before)
     field += [SearchRun(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
@@ -255,7 +282,19 @@ def arrivals(
 def finished(
     runners: Sequence[SearchRun], options: MultiStartOptions = MultiStartOptions()
 ) -> list[SearchRun]:
-    """Those whose steps no longer help, and the best; the best first."""
+    """Select the searches whose steps help no longer, and the best.
+
+    Parameters
+    ----------
+    runners : sequence of SearchRun
+        The best first.
+    options : MultiStartOptions
+
+    Returns
+    -------
+    list of SearchRun
+        The best first.
+    """
     return [runner for i, runner in enumerate(runners) if runner.done or i < options.kept]
 
 

@@ -102,12 +102,20 @@ class LoopPlant:
 
 @dataclass(frozen=True)
 class PlantSet:
-    """All plants, p x m with p <= m or m = 1, in the units of the first: ω₀ in rad/s, force in N/m;
-    T and τ in 1/ω₀.
+    """All plants, p x m with p <= m or m = 1, in the units of the first; T and τ in 1/ω₀.
 
-    `poles` (P, n) and `residues` (P, n, p, m) are those of the continuous plants, the shorter ones
-    with zeros. At a pole 0 the residue's imaginary part is that of 1/s². `out` = Uᵀ (c, p) and
-    `into` = V (m, c) in the coordinates of the plants: identities where they are turned.
+    Attributes
+    ----------
+    plants : tuple of LoopPlant
+    omega_0, force : float
+        The units, rad/s and N/m.
+    period, delay : float or None, float
+        In 1/ω₀.
+    poles, residues : array (P, n), (P, n, p, m)
+        Of the continuous plants, the shorter ones with zeros. At a pole 0 the residue's imaginary
+        part is that of 1/s².
+    out, into : array (c, p), (m, c)
+        Uᵀ and V in the coordinates of the plants: identities where they are turned.
     """
 
     plants: tuple[LoopPlant, ...]

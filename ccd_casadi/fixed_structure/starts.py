@@ -39,12 +39,23 @@ SKEWED = (
 
 
 def by_rules(problem: Problem, crossovers: Array) -> Array:
-    """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
+    """Make controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
     Notches come narrow and wide, and shifted to either side; in two more shapes the last biquad is
     a lead, or lifts |L| at the first anti-resonance, whose dip bounds |S|. Of several biquads two
     are skewed notches at the first resonance too, which turn its circle away from -1; where the
     shape ends at ω_b the last one is a filter at the crossover instead.
+
+    Parameters
+    ----------
+    problem : Problem
+    crossovers : array (k,)
+        In the problem's units.
+
+    Returns
+    -------
+    array (N, n)
+        κ of each.
     """
     tops, count = problem.resonances, problem.structure.biquads
     plain = [(0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)]
@@ -85,9 +96,21 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
 
 
 def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:
-    """(N, n) random controllers with these crossovers.
+    """Draw controllers with given crossovers.
 
     A biquad has its zeros at a resonance, or its poles at an anti-resonance, or is anywhere.
+
+    Parameters
+    ----------
+    problem : Problem
+    crossovers : array (N,)
+        In the problem's units.
+    rng : Generator
+
+    Returns
+    -------
+    array (N, n)
+        κ of each.
     """
     tops = problem.resonances
     known = np.concatenate([tops, problem.antiresonances])

@@ -225,11 +225,23 @@ class UncertainPlant:
 class ModalSum:
     """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
-    k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones are free, k = g = 0, and come first; the others are in the order of
-    their numbers. `away`: the stiffness drives it away, k = -w², g = 0, with w (1/s) in place
-    of ω. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
-    over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
+        k = (ω (1 + shift)(1 + own shift))²
+        g = factor (given + 2 ζ ω (1 + shift)(1 + own shift))
+
+    Attributes
+    ----------
+    omega : array (n,)
+    rigid : array (n,) of bool
+        Free ones, k = g = 0, which come first; the others are in the order of their numbers.
+    given, zeta : array (n,), float
+        Of g.
+    drive, reading : array (n, m), (n, p)
+        b_i and c_i.
+    away : array (n,) of bool
+        The stiffness drives it away: k = -w², g = 0, with w (1/s) in place of ω.
+    moving : callable or None
+        ω and b_i c_i over boxes of the parameters that modes move with, the last ones; see
+        `moving_modes`.
     """
 
     omega: Array

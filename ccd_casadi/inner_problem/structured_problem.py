@@ -85,8 +85,19 @@ class ChannelProblem:
 
 
 def of_sensor(structure: Structure, counts: bool) -> Structure:
-    """The structure of one of several sensors on one actuator: the one whose error counts alone may
-    have an integrator, as a second one would drift against it."""
+    """Derive the structure of one of several sensors on one actuator.
+
+    Parameters
+    ----------
+    structure : Structure
+    counts : bool
+        Whether its error counts: that sensor alone may have an integrator, as a second one would
+        drift against it.
+
+    Returns
+    -------
+    Structure
+    """
     return replace(structure, integrator=structure.integrator and counts)
 
 

@@ -133,10 +133,15 @@ def is_compiled(group: str) -> bool:
 
 
 def ensure_compiled(*groups: str, options: CompilationOptions = CompilationOptions()) -> None:
-    """Compile groups of kernels, all if none is named, on two processes unless their stamps say
-    that they are; words on stderr.
+    """Compile groups of kernels on two processes unless their stamps say that they are.
 
-    What a process leaves undone is compiled where it is needed, in silence.
+    Words are on stderr. What a process leaves undone is compiled where it is needed, in silence.
+
+    Parameters
+    ----------
+    groups : str
+        Names; all groups if none is given.
+    options : CompilationOptions
     """
     groups = groups or tuple(GROUPS)
     if all(map(is_compiled, groups)):

@@ -31,9 +31,18 @@ class UnstableModes(NamedTuple):
 
 
 def unstable_part(A, C):
-    """V, and P (k, k) of A_uᵀP + P A_u = (C V)ᵀC V with A V = V A_u; Y is V P⁻¹ Vᵀ.
+    """Find the unstable part of a plant: A V = V A_u, and P of A_uᵀP + P A_u = (C V)ᵀC V.
 
-    P is singular where C does not see one of the modes.
+    Y = V P⁻¹ Vᵀ; P is singular where C does not see one of the modes.
+
+    Parameters
+    ----------
+    A, C : arrays (n, n), (p, n)
+        Scaled plant.
+
+    Returns
+    -------
+    V, P : arrays (n, k), (k, k)
     """
     T, V = schur(A)
     grow = np.diag(T) > 0.0  # of a pair both: LAPACK's blocks have equal diagonals

@@ -22,7 +22,12 @@ from ccd_casadi.support.text import HZ
 
 
 class Slopes(NamedTuple):
-    """∂A, ∂B, ∂C with a leading axis over θ."""
+    """Derivatives of a system to θ, n_θ of them.
+
+    Attributes
+    ----------
+    dA, dB, dC : array (n_θ, n, n), (n_θ, n, m), (n_θ, p, n)
+    """
 
     dA: Array
     dB: Array
@@ -94,7 +99,13 @@ def _entry(values: tuple[float, ...], i: int, channels: int, key: str) -> float:
 
 @dataclass(frozen=True)
 class Wiring:
-    """The actuators and the sensors of a plant."""
+    """The actuators and the sensors of a plant.
+
+    Attributes
+    ----------
+    actuator, sensor : Filters
+        Before the forces; behind the sensors.
+    """
 
     actuator: Filters = Filters()
     sensor: Filters = Filters()

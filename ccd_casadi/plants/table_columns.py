@@ -66,6 +66,21 @@ _PLAIN = ("-", "1", "abs", "linear")  # units of a ratio
 
 
 def npz_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a .npz file, without objects.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    dict of array
+
+    Raises
+    ------
+    UserError
+        The file cannot be read.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
@@ -89,7 +104,19 @@ def choices(quantity: str) -> str:
 
 
 def refuse_polynomials(path: Path, names: Iterable[str]) -> None:
-    """Raise UserError where these names of a file, or of its struct, are a transfer function."""
+    """Refuse a file, or a struct of it, that holds a transfer function.
+
+    Parameters
+    ----------
+    path : Path
+    names : iterable of str
+        What it holds.
+
+    Raises
+    ------
+    UserError
+        A numerator and a denominator are among the names.
+    """
     given = {name.casefold(): name for name in names}
     for num, den in (("num", "den"), ("numerator", "denominator")):
         if {num, den} <= given.keys():
@@ -129,7 +156,17 @@ def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColum
 
 
 def texts_of(value: Any) -> tuple[str, ...]:
-    """The texts of an array or a cell of them; none where it holds anything else."""
+    """Read the texts of an array or a cell of them.
+
+    Parameters
+    ----------
+    value : any
+
+    Returns
+    -------
+    tuple of str
+        Empty where it holds anything else.
+    """
     if scipy.sparse.issparse(value):
         return ()
     found = np.asarray(value)
@@ -143,7 +180,23 @@ def texts_of(value: Any) -> tuple[str, ...]:
 
 
 def one_text(path: Path, name: str, texts: Iterable[str]) -> str:
-    """What several texts, one a channel, have in common. Raises UserError where they differ."""
+    """Reduce several texts, one a channel, to what they have in common.
+
+    Parameters
+    ----------
+    path, name : Path, str
+        Where they are.
+    texts : iterable of str
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    UserError
+        They differ.
+    """
     found = {text.strip() for text in texts}
     if len(found) != 1:
         words = f"holds several texts; give one unit for all channels: {', '.join(sorted(found))}"
@@ -186,7 +239,23 @@ def of_response(name: str) -> bool | None:
 
 
 def compliance_of(path: Path, name: str, unit: str) -> float:
-    """Factor of a unit of a response to m/N. Raises UserError where it is not understood."""
+    """Read the factor of a unit of a response to m/N.
+
+    Parameters
+    ----------
+    path, name : Path, str
+        Where it is.
+    unit : str
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    UserError
+        The unit is not understood.
+    """
     key = "" if unit.casefold() in _PLAIN else unit.casefold()
     if key not in COMPLIANCE or MEGA.match(unit):
         raise UserError(f"{path}: {name}: is {unit!r}; it may be {choices('G')}")

@@ -132,7 +132,18 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
 
 
 def requirement_lines(result: Mapping[str, Any]) -> list[str]:
-    """Write the requirements for the terminal, one line for each."""
+    """Write the requirements for the terminal.
+
+    Parameters
+    ----------
+    result : mapping
+        As result.json has it.
+
+    Returns
+    -------
+    list of str
+        One line for each.
+    """
     found = []
     for name, required, achieved, margin, where, evidence in _requirement_rows(result):
         at = f", {where}" if where else ""
@@ -194,7 +205,20 @@ def requirement_place(one: Mapping[str, Any]) -> str:
 
 
 def facts(table: str, *known: Any) -> list[Fact]:
-    """Quantity, value, remark: the rows of a table of `templates/facts.txt`, a line each."""
+    """Render the rows of a table of `templates/facts.txt`, a line each.
+
+    Parameters
+    ----------
+    table : str
+        Its name.
+    known : any
+        What its words are of.
+
+    Returns
+    -------
+    list of (str, str, str)
+        Quantity, value, remark.
+    """
     text = _text(f"facts.{table}", *known)
     rows = ([*line.split(" :: ", 2), "", ""] for line in text.split("\n") if line)
     return [(quantity, value, remark) for quantity, value, remark, *_ in rows]

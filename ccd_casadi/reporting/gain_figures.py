@@ -57,7 +57,22 @@ def run_view(run: FinishedRun) -> LoopView:
 
 
 def over_hz(label: str, curves: Sequence[Curve], ends: tuple[float, float], **more: Any) -> Panel:
-    """Gains over frequency, both axes logarithmic."""
+    """Make a panel of gains over frequency, both axes logarithmic.
+
+    Parameters
+    ----------
+    label : str
+        Of the gains, with unit.
+    curves : sequence of Curve
+    ends : (float, float)
+        Hz.
+    more : any
+        Further fields of the panel.
+
+    Returns
+    -------
+    Panel
+    """
     kept = {"log_y": True, **more}
     return Panel("frequency (Hz)", label, tuple(curves), log_x=True, x_range=ends, **kept)
 
@@ -71,7 +86,19 @@ def of_plants(x: Array, values: Array) -> tuple[tuple[Curve], tuple[Band, ...]]:
 
 
 def bandwidth_level(hz: float, colour: str = GREY, text: str = "") -> Level:
-    """ω_b on the axis of frequency."""
+    """Mark ω_b on the axis of frequency.
+
+    Parameters
+    ----------
+    hz : float
+    colour : str
+    text : str
+        After its number.
+
+    Returns
+    -------
+    Level
+    """
     return Level(hz, f"ω_b {number(hz, 4)} Hz{text}", True, colour)
 
 
@@ -79,7 +106,24 @@ def sensitivity_panel(
     curves: Sequence[Curve], ends: tuple[float, float], S_max: float, at: Sequence[Level] = (),
     label: str = "σ_max(S) (–)", **more: Any,
 ) -> Panel:  # fmt: skip
-    """S of any loops, with S_max, -3 dB, and the words of ω_b where S crosses that."""
+    """Make the panel of S of any loops, with S_max, -3 dB, and ω_b where S crosses that.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+    ends : (float, float)
+        Hz.
+    S_max : float
+    at : sequence of Level
+        ω_b, with words.
+    label : str
+    more : any
+        Further fields of the panel.
+
+    Returns
+    -------
+    Panel
+    """
     levels = [Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY)]
     levels += [replace(level, text="") for level in at]
     words = tuple(Mark(v.value, 2**-0.5, v.text, "", v.colour, (8.0, -8.0)) for v in at)
@@ -198,8 +242,24 @@ def forbidden(
     S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float,
     shape: tuple[Array, Array] | None = None,
 ) -> tuple[Area, ...]:  # fmt: skip
-    """Where |S| may not be, over Hz: above S_max, above S_low up to `low_hz`, and above a shape
-    (Hz, its gain, NaN where it asks nothing): one ground, whichever of them is the lowest."""
+    """Find where |S| may not be: above S_max, above S_low up to `low_hz`, and above a shape.
+
+    Parameters
+    ----------
+    S_max, S_low, low_hz : float
+        The bounds.
+    low, high : float
+        Ends of the picture in Hz.
+    top : float
+        Its largest |S|.
+    shape : (array (N,), array (N,)) or None
+        Hz and gain, NaN where it bounds nothing.
+
+    Returns
+    -------
+    tuple of Area
+        One ground, whichever bound is the lowest.
+    """
     hz = np.concatenate([[low, low_hz, low_hz, high], np.empty(0) if shape is None else shape[0]])
     past = np.zeros(len(hz))
     past[2] = 1.0  # the second of the two at `low_hz` is beyond it

@@ -120,7 +120,18 @@ def loci_of(L: np.ndarray, largest: float = LARGEST) -> np.ndarray:
 
 
 def drawable(values: np.ndarray, largest: float = LARGEST) -> np.ndarray:
-    """The values, NaN in both parts where one exceeds `largest` in modulus."""
+    """Replace values that no picture holds by NaN in both parts.
+
+    Parameters
+    ----------
+    values : array of complex
+    largest : float
+        Modulus.
+
+    Returns
+    -------
+    array of complex
+    """
     return np.where(np.abs(values) <= largest, values, complex(np.nan, np.nan))
 
 

@@ -58,9 +58,23 @@ def head_of(
     title: str, good: bool, status: str, reason: str, meta: str, lead: str,
     result: Mapping[str, Any], decision: str = "",
 ) -> Head:  # fmt: skip
-    """The head of a page about a run; the badge is not green where the run's verdict warns.
+    """Make the head of a page about a run; the badge is not green where the run's verdict warns.
 
-    `decision`: what the page answers, where that is not whether to build the design.
+    Parameters
+    ----------
+    title : str
+    good : bool
+        Whether what the page is about holds.
+    status, reason, meta, lead : str
+        Of the badge; why; seed and versions; the page in a sentence.
+    result : mapping
+        As result.json has it.
+    decision : str
+        What the page answers, where that is not whether to build the design.
+
+    Returns
+    -------
+    Head
     """
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
     clean &= unproven(result) is None

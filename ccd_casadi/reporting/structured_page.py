@@ -88,7 +88,17 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
 
 def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
-    """Gain and sections in Hz and damping; of `result` only `controller` is read."""
+    """Write gain and sections of a controller in Hz and damping.
+
+    Parameters
+    ----------
+    result : mapping
+        Only `controller` is read.
+
+    Returns
+    -------
+    Words, Table
+    """
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
     words = paragraph("report.sections", controller, gain_words(controller))

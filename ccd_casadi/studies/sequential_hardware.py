@@ -53,9 +53,21 @@ class HardwareDesign:
 def first_resonance(
     problem: CoDesignProblem, theta: Array, evaluate: Evaluate | None = None
 ) -> tuple[float, Array]:
-    """ω_1 of the first flexible mode in rad/s and ∂ω_1/∂θ = φᵀ(K' - ω_1² M')φ/(2ω_1), (n,).
+    """Compute the first resonance ω_1 and its slope ∂ω_1/∂θ = φᵀ(K' - ω_1² M')φ/(2ω_1).
 
-    NaN where all modes are rigid. `evaluate`: a model in place of the plant.
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    theta : array (n,)
+        SI.
+    evaluate : callable or None
+        A model in place of the plant.
+
+    Returns
+    -------
+    float
+        rad/s, of the first flexible mode; NaN where all modes are rigid.
+    array (n,)
     """
     system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
     modal = modal_plant(system, problem.suspension.free)

@@ -186,7 +186,16 @@ def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:
 
 
 def baseline_of(problem: CoDesignProblem) -> Baseline:
-    """The baseline's inner problem."""
+    """Make the baseline's inner problem, by the kind of controller.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Baseline
+    """
     return BASELINES[type(problem.controller)](problem)
 
 

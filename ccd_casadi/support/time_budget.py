@@ -23,7 +23,19 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class StageOptions:
-    """Up to which share of a budget each stage of a search may last."""
+    """Up to which share of a budget each stage of a search may last.
+
+    Attributes
+    ----------
+    start : float
+        The search for a first controller.
+    search : float
+        Over θ.
+    ending : float
+        Of the best one: polish, worse plants, wider searches at its θ.
+    repair : float
+        Of a design that the judge refuted.
+    """
 
     start: float = 0.3  # the search for a first controller
     search: float = 0.6  # over θ
@@ -112,14 +124,29 @@ def until(deadline: float) -> Iterator[None]:
 
 @contextmanager
 def stage(share: float) -> Iterator[None]:
-    """Within the block the time is up with a share of the budget; infinite: never."""
+    """Within the block the time is up with a share of the budget.
+
+    Parameters
+    ----------
+    share : float
+        Of an infinite budget: never.
+
+    Returns
+    -------
+    context manager
+    """
     own = budget()
     with until(own.until(share) if math.isfinite(own.minutes) else math.inf):
         yield
 
 
 def time_is_up() -> bool:
-    """Whether what searches is to end with what it has."""
+    """Decide whether what searches is to end with what it has.
+
+    Returns
+    -------
+    bool
+    """
     deadline = _DEADLINE.get()
     return deadline < math.inf and time.monotonic() > deadline
 

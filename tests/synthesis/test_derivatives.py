@@ -168,7 +168,7 @@ def test_gradient_of_the_bound_at_a_sharp_transmission_zero() -> None:
         return logarithms(synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures)[3:]
 
     found, spread = best_difference(moved)
-    assert spread[0] < 1e-6 * abs(found[0])
+    assert spread[0] < 1e-5 * abs(found[0])  # rounding leaves 1e-7 to 2e-6, by the processor
     known = max(ACCURACY * abs(found[0]), spread[0])  # what rounding leaves of the difference
     assert elasticities(design, theta)[3, 1] == pytest.approx(found[0], abs=known)
 
