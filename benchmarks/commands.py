@@ -99,9 +99,9 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         found = rows(options.long, options.compile, Path(folder))
     print(f"{'seconds':24s}{'real':>9s}{'last':>9s}{'asked':>9s}{'processor':>11s}{'last':>9s}")
-    for name, asked in ASKED.items():
+    for name, required in ASKED.items():
         real, spent = found.get(name, (None, None))
-        cells = (real, known.get(f"s_{name}"), asked, spent, known.get(f"cpu_s_{name}"))
+        cells = (real, known.get(f"s_{name}"), required, spent, known.get(f"cpu_s_{name}"))
         widths = (9, 9, 9, 11, 9)
         text = "".join(
             f"{'-' if cell is None else format(cell, '.3g'):>{width}s}"

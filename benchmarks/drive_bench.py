@@ -45,7 +45,7 @@ def case_of(sensors: str, shift: float, drive: str, filters: int, setpoint: int)
 def main(names: list[str]) -> None:
     """Print a line for each row."""
     for name in names or [*ROWS]:
-        problem, begun = drive_problem(case_of(*ROWS[name])), perf_counter()
+        problem, started = drive_problem(case_of(*ROWS[name])), perf_counter()
         try:
             found = design_drive(problem.cascade, problem.uncertain, problem.bounds,
                                  problem.sampling, options=replace(DriveOptions()))  # fmt: skip
@@ -54,7 +54,7 @@ def main(names: list[str]) -> None:
             continue
         print(f"{name:26s}{found.free.bandwidth / HZ:7.1f} Hz free {found.bandwidth / HZ:7.1f} "
               f"rounded  {found.status}, {found.proof.outcome.name.lower()}  "
-              f"{perf_counter() - begun:.0f} s", flush=True)  # fmt: skip
+              f"{perf_counter() - started:.0f} s", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":

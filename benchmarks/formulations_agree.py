@@ -50,8 +50,8 @@ def of_kind(problem: CoDesignProblem, kind: str, seed: int) -> CoDesignProblem:
         shift = float(rng.uniform(0.002, 0.02))
         return replace(problem, robust=RobustSet(shift, 3, (), float(rng.choice([0.0, shift]))))
     if kind == "compliance":
-        asked = replace(problem, inner=replace(problem.inner, compliance_max=1e300))
-        best = true_inner(asked, problem.start).optimum
+        required = replace(problem, inner=replace(problem.inner, compliance_max=1e300))
+        best = true_inner(required, problem.start).optimum
         if best is not None:
             most = float(best.figures.compliance * rng.uniform(0.5, 1.2))
             return replace(problem, inner=replace(problem.inner, compliance_max=most))

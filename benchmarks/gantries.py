@@ -98,12 +98,12 @@ def gantry(
     along = np.linspace(-0.5, 0.5, 41)
     spread = sum(shape(x).T @ shape(x) for x in along) / 41.0
     own = beam * spread + slide * shape(at / span).T @ shape(at / span)
-    bent = 0.5 * stiffness * (np.pi / span) ** 4 * span
+    bending = 0.5 * stiffness * (np.pi / span) ** 4 * span
     ends = ca.DM([[1.0, 0.0, -1.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0, 0.0]])
     drives = ca.DM([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
     return {
         "mass": ca.diagcat(ca.diag(ca.vertcat(m, m)), own),
-        "stiffness": guide * ends.T @ ends + ca.diagcat(ca.DM.zeros(4, 4), bent),
+        "stiffness": guide * ends.T @ ends + ca.diagcat(ca.DM.zeros(4, 4), bending),
         "damping_ratio": damping,
         "input": drives.T,
         "output": drives,

@@ -131,7 +131,7 @@ KINDS: dict[str, Callable[[Path, int], list[str]]] = {
 }  # fmt: skip
 
 
-def begun(kind: str, folder: Path) -> None:
+def started(kind: str, folder: Path) -> None:
     """A folder to start in."""
     folder.mkdir()
     (folder.parent / "sampling.py").write_text(SAMPLING)
@@ -140,7 +140,7 @@ def begun(kind: str, folder: Path) -> None:
         shutil.copy(folder.parent / "quick.toml", folder / "case.toml")
 
 
-def started(words: list[str]) -> subprocess.Popen[str]:
+def process_of(words: list[str]) -> subprocess.Popen[str]:
     """A process of its own group, so that its workers may be found."""
     return subprocess.Popen(
         words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -182,12 +182,12 @@ def story(
 ) -> None:
     """Kill and start again a few times, let it end, and compare with the undisturbed run."""
     folder = place / f"{kind}{number}"
-    begun(kind, folder)
+    started(kind, folder)
     words = KINDS[kind](folder, number)
     before: set[str] = set(rows(folder))
     for _ in range(KILLS_A_STORY):
         # What is resumed has less to do than the whole: half the time, or it has mostly ended.
-        if not killed(started(words), rng, tally, 0.5 * whole):
+        if not killed(process_of(words), rng, tally, 0.5 * whole):
             break
         tally.kills += 1
         found = rows(folder)
@@ -242,7 +242,7 @@ def undisturbed(kind: str, place: Path, which: int) -> tuple[Path, float]:
     seconds = []
     for attempt in range(2):
         folder = place / f"plain{attempt}_{kind}{which}"
-        begun(kind, folder)
+        started(kind, folder)
         start = time.perf_counter()
         subprocess.run(KINDS[kind](folder, which), cwd=ROOT, check=True)
         seconds.append(time.perf_counter() - start)

@@ -87,8 +87,8 @@ def available() -> dict[str, str]:
     "Katmai" is Prescott's other name; wheels build Zen from Haswell's kernels.
     """
     able = flags()
-    asked = {name: architecture(name) for name, needs in NEEDS.items() if needs <= able}
-    return {name: found for name, found in asked.items() if found}
+    required = {name: architecture(name) for name, needs in NEEDS.items() if needs <= able}
+    return {name: found for name, found in required.items() if found}
 
 
 def run_tests(

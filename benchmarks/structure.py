@@ -6,9 +6,9 @@ Counts by the syntax tree alone, of the two packages and of each folder that is 
 scikit-fem, optimistix, pyMOR, python-control, ...). A *bare constant* is an upper-case name of a
 module that is bound to numbers; *of algorithms*, counted of ours alone, is one that is neither of
 drawing nor in `EXEMPT` (physics, units, indices). *Used across rooms*: public functions and classes
-that another package folder imports, but exceptions, enumerations and tables of a case file, whose keys
-say what they mean; documented is one whose docstring has a section of NumPy's (Parameters, Returns,
-Attributes, Raises). A function that takes and returns nothing needs a sentence alone.
+that another package folder imports, but exceptions, enumerations and tables of a case file, whose
+keys say what they mean; documented is one whose docstring has a section of NumPy's (Parameters,
+Returns, Attributes, Raises). A function that takes and returns nothing needs a sentence alone.
 """
 
 import ast

@@ -49,10 +49,10 @@ def problems(count: int) -> list[tuple[int, Case]]:
     found: list[tuple[int, Case]] = []
     seed = 1000
     while len(found) < count:
-        asked = case(seed)
-        sections = asked.structure.lead + asked.structure.biquads
-        if len(asked.mass) > 1 and asked.uncertain.names and sections:
-            found.append((seed, asked))
+        required = case(seed)
+        sections = required.structure.lead + required.structure.biquads
+        if len(required.mass) > 1 and required.uncertain.names and sections:
+            found.append((seed, required))
         seed += 1
     return found
 
@@ -104,12 +104,12 @@ def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
 
 
 def peer(
-    asked: Case, plants: list[ScaledPlant], own: float, seconds: float
+    required: Case, plants: list[ScaledPlant], own: float, seconds: float
 ) -> tuple[float, float, int, float]:
     """The best judged bandwidth in Hz (0: none) after `own` seconds and at the end, starts used,
     processor time."""
     began = time.process_time()
-    problem: Any = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    problem: Any = problem_for(plants, required.structure, required.bounds, required.sampling)
     soon, best, used, turn = 0.0, 0.0, 0, 0
     while time.process_time() - began < seconds:
         for kappa in _pool(problem, STARTS, np.random.default_rng(turn), None):
@@ -118,7 +118,7 @@ def peer(
             used += 1
             end = by_slsqp(problem, started(problem, kappa), began + seconds)
             if end is not None:
-                made = DesignSearch(problem, plants, asked.sampling).designed(end, (), 1, 0)
+                made = DesignSearch(problem, plants, required.sampling).designed(end, (), 1, 0)
                 if made.certified:
                     best = max(best, made.bandwidth / (2.0 * np.pi))
             if time.process_time() - began <= own:
@@ -157,22 +157,22 @@ def main() -> None:
     if options.lot is not None:
         todo = [todo[i] for i in np.random.default_rng(options.lot).permutation(len(todo))]
     known = {row["seed"] for row in rows}
-    for seed, asked in todo:
+    for seed, required in todo:
         if seed in known:
             continue
-        plants = asked.uncertain.plants(asked.uncertain.corners())
+        plants = required.uncertain.plants(required.uncertain.corners())
         began = time.process_time()
-        made = synthesise_sections(plants, asked.structure, asked.bounds, sampling=asked.sampling,
-                                   starts=STARTS, seed=0)  # fmt: skip
+        made = synthesise_sections(plants, required.structure, required.bounds,
+                                   sampling=required.sampling, starts=STARTS, seed=0)  # fmt: skip
         own = time.process_time() - began
-        soon, theirs, used, spent = peer(asked, plants, own, options.patience * own)
+        soon, theirs, used, spent = peer(required, plants, own, options.patience * own)
         rows.append({
             "seed": seed, "hz": made.bandwidth / (2.0 * np.pi) if made.certified else 0.0,
             "seconds": round(own, 2), "slsqp_hz_in_that_time": soon, "slsqp_hz": theirs,
             "slsqp_starts": used, "slsqp_seconds": round(spent, 2),
         })  # fmt: skip
         if not made.certified and theirs == 0.0 and made.bandwidth > 0.0:
-            rows[-1]["impossible"] = impossible(asked, made.bandwidth)
+            rows[-1]["impossible"] = impossible(required, made.bandwidth)
         print(json.dumps(rows[-1]), flush=True)
         options.out.write_text(json.dumps({"counts": judged(rows), "rows": rows}, indent=1) + "\n")
     print(json.dumps(judged(rows)))

@@ -40,8 +40,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         )
         responses = outer.responses(outer.point_of(done.theta, done.weights))
     seconds = options.seconds()
-    told = insight_dict(done, front, responses)
-    write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})
+    reported = insight_dict(done, front, responses)
+    write_json(folder / "insight.json", reported | {"seed": options.seed, "seconds": seconds})
     verified = [point for point in front.points if point.verified]
     inform(f"front         {len(verified)} of {len(front.points)} points verified, "
            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip

@@ -72,13 +72,13 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     v = FIGURES[result.get("minimise", BANDWIDTH.key)]
     if v is BANDWIDTH:
-        lines, told = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
+        lines, reported = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
     else:
-        of, told = (
+        of, reported = (
             v.shown(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
         )
         lines = [f"{v.words:<13} {of} over the set", bandwidth]
-    return [f"{lines[0]}   {prediction_words(result, told)}".rstrip(), *lines[1:]]
+    return [f"{lines[0]}   {prediction_words(result, reported)}".rstrip(), *lines[1:]]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:

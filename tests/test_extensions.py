@@ -71,25 +71,25 @@ print(json.dumps(answers))
 )
 def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: Path) -> None:
     needs = f"needs the extension {name}, which is not installed\n"
-    own, asked = shipped()[name], list[tuple[list[str], str]]()
+    own, required = shipped()[name], list[tuple[list[str], str]]()
     for word in own.commands:
         for words in ([f"ccd_casadi.{word}"], ["ccd_casadi", word]):
-            asked.append((words, f"`{word}` {needs}"))
+            required.append((words, f"`{word}` {needs}"))
     for model in own.plants:
         case = tmp_path / f"{model}.toml"
         case.write_text(CASE.read_text().replace('"two_mass"', f'"{model}"'))
         line = f"{case}: plant.model: '{model}' {needs}"
-        asked.append((["ccd_casadi", "check", str(case)], line))
+        required.append((["ccd_casadi", "check", str(case)], line))
     if name == "cluster":
         words = [*solve_words(tmp_path, "--scheduler", "tcp://a:1")[1:]]
-        asked.append((words, f"--scheduler {needs}"))
+        required.append((words, f"--scheduler {needs}"))
     if name == "formats":
-        asked.append((["ccd_casadi.deploy", str(tmp_path), "--fmu"], f"--fmu {needs}"))
-    words = [words for words, _ in asked] + [["ccd_casadi", "foo"]]
+        required.append((["ccd_casadi.deploy", str(tmp_path), "--fmu"], f"--fmu {needs}"))
+    words = [words for words, _ in required] + [["ccd_casadi", "foo"]]
     done = run_without(tmp_path, name, words=["-c", ONE_BY_ONE, json.dumps(words)])
     assert (done.returncode, done.stderr) == (0, "")
     *answers, (code, unknown) = json.loads(done.stdout)
-    assert answers == [[2, line] for _, line in asked]
+    assert answers == [[2, line] for _, line in required]
     assert code == 2
     assert all(f" {word}," not in unknown for word in own.commands)
 

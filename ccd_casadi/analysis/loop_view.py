@@ -63,7 +63,7 @@ class Bounded:
     over: Callable[[Array], Array]
     words: tuple[str, str, str]
     compliance_max: float | None = None
-    asked: bool = True
+    required: bool = True
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class LoopView:
     @cached_property
     def shares(self) -> Array:
         """The largest gain of any plant over its bound (3, k); γ/|W| bounds the model's alone."""
-        sizes = self.sizes[:3].max(axis=1) if self.bounded.asked else self.gains
+        sizes = self.sizes[:3].max(axis=1) if self.bounded.required else self.gains
         return np.asarray(sizes / self.bounds)
 
 

@@ -148,9 +148,11 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
                 if getattr(own, key) != getattr(ChannelTable, key, None):
                     raise fail(f"controller.channel.{name}.{key}", "is given by like; drop it")
         for key, where in (("S_max", "inner"), ("M_K", "weights")):
-            asked, whole = getattr(own, key), getattr(tables[where], key)
-            if asked is not None and asked > whole:
-                words = f"is {asked:g}, above {where}.{key} = {whole:g}, which the whole loop keeps"
+            required, whole = getattr(own, key), getattr(tables[where], key)
+            if required is not None and required > whole:
+                words = (
+                    f"is {required:g}, above {where}.{key} = {whole:g}, which the whole loop keeps"
+                )
                 remedy = f"give less, or raise {where}.{key} to that of the loosest channel"
                 raise fail(f"controller.channel.{name}.{key}", f"{words}; {remedy}")
         if own.M_K is not None and controller.weighted_level is None:

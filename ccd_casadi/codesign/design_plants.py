@@ -96,8 +96,10 @@ def best_over_design_plants(
     result["seconds"] = perf_counter() - terms.began
     if problem.robust is not None:
         names = [choice.robust.design_at for choice in choices if choice.robust]
-        told = [{key: item.result[key] for key in REPORTED if key in item.result} for item in found]
-        tried = dict(zip(names, told, strict=True))
+        reported = [
+            {key: item.result[key] for key in REPORTED if key in item.result} for item in found
+        ]
+        tried = dict(zip(names, reported, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
     result["reason"] = outer_of(sampler).failure_reason(found[best], share)

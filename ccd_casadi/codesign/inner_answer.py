@@ -199,13 +199,13 @@ def structured_answer(
         raise UserError(words)
     begin_at, tell, workers = options.begin_at, options.tell, options.workers
     head = head_of(problem, theta)
-    asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
+    required = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
-        kappa = sections_kappa(begin_at, structure_of(asked))
-        asked = with_structured(asked, warm_starts=(kappa,))
-    asked, made, worst = prepared(asked, tell, workers, begin_at is not None)
+        kappa = sections_kappa(begin_at, structure_of(required))
+        required = with_structured(required, warm_starts=(kappa,))
+    required, made, worst = prepared(required, tell, workers, begin_at is not None)
     fastest = made.bandwidth
-    asked, made, least = least_from(asked, theta, made, tell, workers)
+    required, made, least = least_from(required, theta, made, tell, workers)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
@@ -218,15 +218,15 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
-    on_box = DesignOnBox(asked, theta, made)
+    on_box = DesignOnBox(required, theta, made)
     if worst is None or least is not None:
         worst = on_box.worst(workers=workers)[0]
     wide, checked, proof = on_box.judged(worst, workers)
     assert made.controller is not None
-    second = second_on_set(asked, theta, made)
+    second = second_on_set(required, theta, made)
     passed = wide.passed and not proof.refuted and second.agrees is not False
     figures = head | {
-        **design_dict(asked, theta, made),
+        **design_dict(required, theta, made),
         "active": active_of(made),
         "feasible": True,
         "objective": objective(problem, theta, value),
@@ -235,8 +235,8 @@ def structured_answer(
         "judge": judgement_of(wide, checked).entry,
         "second_engine": second.entry,
         "syntheses": 1,
-        **budget_entry(asked, theta, made.controller),
-        **move_entry(asked, theta, made.controller),
+        **budget_entry(required, theta, made.controller),
+        **move_entry(required, theta, made.controller),
     }
     status = "verified" if passed else "not_verified"
-    return InnerAnswer(status, figures, sections_controller(made, asked.sampling))
+    return InnerAnswer(status, figures, sections_controller(made, required.sampling))

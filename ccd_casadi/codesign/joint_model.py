@@ -195,9 +195,9 @@ class JointModel(TrustRegionModel[JointLoops]):
         found = assess(self.first_loops, kappa, tau)
         if not found.stable:
             return self.place(self.start), np.inf
-        begun = Point(kappa, tau, found)
+        started = Point(kappa, tau, found)
         radius = options.first_radius
-        point = ascend(self.first_loops, begun, iterations=steps, radius=radius).point
+        point = ascend(self.first_loops, started, iterations=steps, radius=radius).point
         x = np.concatenate([z, point.kappa, [point.tau]])
         unmet = hardware_at(self.problem, self.middle).constraints * self.weight
         worth = np.exp(point.tau - self.tau)

@@ -326,15 +326,15 @@ def pieces_from(
     InnerSample
         The best θ on the way.
     """
-    problem, asked = sampler.problem, [best]
+    problem, required = sampler.problem, [best]
     bounds = box(problem)
     ended = [(bounds.shares(place.x), place.objective) for place in ends if place.stationary]
 
     def at(z: Array) -> Local | None:
         if time_is_up():
             return None
-        asked.extend(sampler.values(bounds.point(z), "local solve"))
-        return local(asked[-1])
+        required.extend(sampler.values(bounds.point(z), "local solve"))
+        return local(required[-1])
 
     @cache
     def local(sample: InnerSample) -> Local | None:
@@ -358,7 +358,7 @@ def pieces_from(
         descend(
             at, start, known, constraints, steps=steps, settled=settled, first=first, ended=ended
         )
-        best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
+        best = min(sampler.latest(required), key=lambda sample: objective_of(problem, sample))
         if sampler.improvements == improvements or ends_early("local solve"):
             break
     return best

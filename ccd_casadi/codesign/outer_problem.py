@@ -160,9 +160,9 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
-    begun = np.clip(program.box.shares(np.atleast_2d(starts)), 0.0, 1.0)
+    started = np.clip(program.box.shares(np.atleast_2d(starts)), 0.0, 1.0)
     ends, verdicts = [], []
-    for start in begun:
+    for start in started:
         raise_dropped()
         with interrupts_kept():  # Ctrl-C ends it after the start that is under way
             result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
@@ -171,8 +171,8 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
         if stats["success"]:
             ends.append((float(result["f"]), np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)))
     if not ends:
-        raise OuterFailure(f"IPOPT converged from none of {len(begun)} starts: {verdicts[0]}")
-    return distinct([(J, lower + width * end) for J, end in ends], program.box, len(begun))
+        raise OuterFailure(f"IPOPT converged from none of {len(started)} starts: {verdicts[0]}")
+    return distinct([(J, lower + width * end) for J, end in ends], program.box, len(started))
 
 
 def distinct(

@@ -62,16 +62,16 @@ def global_check(
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
     values = np.array([objective_of(problem, sample) for sample in able])
     margin = options.better * abs(J) if np.isfinite(J) else 0.0
-    best_x, best, begun = None, J, 0
+    best_x, best, started = None, J, 0
     stationary = np.isfinite(J) and end.kkt.stationarity <= outer.kkt_level
     known = [Place(end.x, J, bool(stationary))]
 
     def solve_from(starts: Sequence[InnerSample]) -> None:
-        nonlocal best_x, best, begun
+        nonlocal best_x, best, started
         for sample in starts:
             if ends_early("local solve"):
                 continue
-            begun += 1
+            started += 1
             place = outer.local_solve(sample, known)
             if place is not None:
                 known.append(place)
@@ -95,7 +95,7 @@ def global_check(
         fresh=fresh,
         feasible=len(able),
         better=int((values < J - margin).sum()),
-        starts=begun,
+        starts=started,
         seed=seed,
         before=J,
         after=best,
@@ -185,7 +185,7 @@ class SearchResult:
     outcome: FormulationResult
     end: PolishedDesign | None
     rounds: int = 1
-    look: GlobalCheck | None = None
+    global_check: GlobalCheck | None = None
 
 
 def search_outer(
@@ -200,7 +200,7 @@ def search_outer(
     """
     outer = outer.prepared(seed)
     end: PolishedDesign | None = None
-    look: GlobalCheck | None = None
+    global_check: GlobalCheck | None = None
     for rounds in count(1):
         outcome = FormulationResult(known, agreed=True)
         if known is None:
@@ -222,14 +222,16 @@ def search_outer(
             last = rounds >= (2 * most if time_is_up() else most)
             more = None if last else outer.extended(end)
         if more is None:
-            outcome, found, look = _after_global_check(outer, outcome, end, formulation, seed)
+            outcome, found, global_check = _after_global_check(
+                outer, outcome, end, formulation, seed
+            )
             moved = found is not end and rounds < most
             more, end = outer.extended(found) if moved else None, found
         if more is None:
             break
         goes_on = known is not None or isinstance(formulation, Direct) or time_is_up()
         outer, known = more, end.x if goes_on else None
-    return SearchResult(outer, outcome, end, rounds, look)
+    return SearchResult(outer, outcome, end, rounds, global_check)
 
 
 def _at_hand(outer: Outer, end: PolishedDesign | None) -> Array | None:
@@ -250,10 +252,10 @@ def _after_global_check(
 ) -> tuple[FormulationResult, PolishedDesign, GlobalCheck]:
     """After the global check over the box, and a last try where the end is not stationary."""
     with outer.sampler.spent.on("box_look"):
-        look = global_check(outer, end, formulation.box_points, seed)
-    if look.x is not None:
+        checked = global_check(outer, end, formulation.box_points, seed)
+    if checked.x is not None:
         with stage(StageOptions.ending), suppress(NoDesign):
-            found = outer.polished(look.x)
+            found = outer.polished(checked.x)
             end = best_end([end, found], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity
     retried = outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level
@@ -271,7 +273,7 @@ def _after_global_check(
         if abs(foreseen / end.value - 1.0) > formulation.tolerance:
             learnt = outer.with_training_sample(outcome, end)
             outcome = replace(learnt, foreseen=foreseen)  # the error that is reported
-    return outcome, end, look
+    return outcome, end, checked
 
 
 def best_end(ends: Sequence[PolishedDesign], level: float, tolerance: float) -> PolishedDesign:
@@ -298,7 +300,7 @@ def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     surrogates = tuple(recalibrated(process, terms.seed) for process in outcome.surrogates)
     outcome = replace(outcome, surrogates=surrogates)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
-    result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.look)
+    result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.global_check)
     result["start"] = start_entry(sampler)
     return Solution(result, outcome, verified, quality)
 

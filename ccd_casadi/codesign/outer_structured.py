@@ -229,9 +229,9 @@ class StructuredOuter(ThetaOuter):
             gap = None if known_gap is None else known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
             survival = survived(problem, loops, design)[0]
-            damping, told = other_damping(problem, loops), None
+            damping, reported = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
-                told = stated_time(problem, best.theta, design.controller, best.value)
+                reported = stated_time(problem, best.theta, design.controller, best.value)
             second = second_on_set(problem, best.theta, design)
             wide, checked, proof, drawn = judgement()
             bar.advance()
@@ -257,7 +257,7 @@ class StructuredOuter(ThetaOuter):
             costs=costs,
             prices=prices,
             gap=gap,
-            told=told,
+            reported=reported,
             second=second,
             counterexamples=on_box.counterexamples(wide, proof, worst),
         )

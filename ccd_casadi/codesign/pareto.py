@@ -110,11 +110,11 @@ def pareto_front(
     if not f_range > options.constant * np.abs(costs).max():
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
     allowed = [i for i in np.argsort(costs) if not violated(problem, looked[i])]
-    begun = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
-    if not begun[0].feasible:
-        raise UserError(f"the run's design is not certified: {begun[0].shortfall}")
-    begun = [sample for sample in begun if sample.feasible]
-    size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
+    started = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
+    if not started[0].feasible:
+        raise UserError(f"the run's design is not certified: {started[0].shortfall}")
+    started = [sample for sample in started if sample.feasible]
+    size, sign = started[0].value, 1.0 if problem.figure.larger_is_better else -1.0
 
     def solved(a: float, b: float, begin: Sequence[InnerSample]) -> FrontPoint | None:
         """The best design for these weights, of local solves from some designs; where each value
@@ -132,7 +132,7 @@ def pareto_front(
 
     extreme, straight = options.end_weight, set[tuple[FrontPoint, FrontPoint]]()
     with Progress(points, "points of the front", quiet=sampler.quiet) as progress:
-        ends = [solved(w / f_range, extreme / w / size, begun) for w in (1.0, extreme)]
+        ends = [solved(w / f_range, extreme / w / size, started) for w in (1.0, extreme)]
         kept = hull(
             [_point(sampler, own, True), *(end for end in ends if end is not None)], options.same
         )

@@ -50,7 +50,7 @@ def result_dict(
     verified: Verified,
     spent: Mapping[str, int],
     quality: tuple[Quality, ...] = (),
-    look: GlobalCheck | None = None,
+    global_check: GlobalCheck | None = None,
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem, tolerance = verified.problem, terms.tolerance
@@ -62,7 +62,7 @@ def result_dict(
     optimality = partial(
         optimal, verified.kkt, level=verified.kkt_level, saddle=verified.saddle,
         tolerance=tolerance, better=verified.gap_words(), unknown=verified.no_gradient_words(),
-        searched=verified.searched(outcome, look),
+        searched=verified.searched(outcome, global_check),
     )  # fmt: skip
     judged = quality[0] if quality else None
     verdict = {  # in the order in which they matter
@@ -116,10 +116,10 @@ def result_dict(
             for one in requirements(verified, figures.get("sensitivity_peak_hz", math.nan))
         ],
         "second_engine": verified.second.entry,
-        "box_look": {} if look is None else look.entry,
+        "box_look": {} if global_check is None else global_check.entry,
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": outcome.iterates,
-        **run_entry(terms, spent, look is not None and look.moved),
+        **run_entry(terms, spent, global_check is not None and global_check.moved),
         "surrogate_quality": quality_dict(quality),
         **evidence,
         **budget_entry(problem, verified.theta, verified.controller),

@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
     prepared,
-    race,
+    search_starts,
     with_range,
     with_warm_start,
 )
@@ -98,7 +98,9 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
         problem = with_warm_start(problem, best.kappa)
 
     def multistart() -> StructuredValue:
-        made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
+        made = search_starts(
+            problem, theta, printer("search at the end", sampler.quiet), sampler.workers
+        )
         found = ProblemAt(problem, theta).value_of(made, 1, workers=sampler.workers)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 

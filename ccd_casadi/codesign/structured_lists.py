@@ -92,8 +92,8 @@ class ListedStructured:
     def judge(self, sampler: Sampler, solution: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
         near = _start(solution)
-        begun = carried(near, replace(sampler.problem, start=near.start), self.scenarios)
-        whole = self.solve(sampler.of(begun), np.array(near.start))
+        started = carried(near, replace(sampler.problem, start=near.start), self.scenarios)
+        whole = self.solve(sampler.of(started), np.array(near.start))
         if whole.verified is not None:
             self.scenarios = structured_of(whole.verified.problem).scenarios
         return whole
@@ -102,15 +102,15 @@ class ListedStructured:
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by; by steps along the truth where the joint search breaks λ."""
     best = first = sampler.values(theta, "near by")[0]
-    asked = sampler
+    required = sampler
     if sampler.problem.figure is BANDWIDTH:
         tell = printer("near by", sampler.quiet)
-        asked, best, _ = joint_search(sampler, theta, tell, ends=())
-    if best.theta == first.theta or violated(asked.problem, best.theta):  # it lost λ
+        required, best, _ = joint_search(sampler, theta, tell, ends=())
+    if best.theta == first.theta or violated(required.problem, best.theta):  # it lost λ
         options = ThetaDescentOptions()
         best = pieces_from(sampler, first, options.settled, options.far_radius)
-        asked = sampler
-    problem = asked.problem
+        required = sampler
+    problem = required.problem
     J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)

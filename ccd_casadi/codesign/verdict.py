@@ -245,25 +245,25 @@ def _sides(kink: Kink) -> list[str]:
 
 
 def search_evidence(
-    starts: int, optima: int, look: GlobalCheck | None, gap: str = "gap not known"
+    starts: int, optima: int, global_check: GlobalCheck | None, gap: str = "gap not known"
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """What IPOPT's starts, the global check over the box and bounds say, in clauses and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     known = f"best of {counted(starts, 'start')}" if starts else "from one start"
     if optima > 1:
         known += f", {optima} distinct optima"
-    if look is None or not look.points:
+    if global_check is None or not global_check.points:
         return (f"{known}, no global check over the box", gap), figures
     counted_up = ("points", "fresh", "feasible", "better", "starts", "seed")
-    figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
-    figures["objective_before"] = look.before
-    own = look.points - look.fresh
+    figures |= {f"box_{name}": getattr(global_check, name) for name in counted_up}
+    figures["objective_before"] = global_check.before
+    own = global_check.points - global_check.fresh
     how = " and ".join(
-        [f"{look.fresh} other theta of the box"] * bool(look.fresh or not own)
+        [f"{global_check.fresh} other theta of the box"] * bool(global_check.fresh or not own)
         + [f"{own} of the run"] * bool(own)
     )
-    if look.moved:
-        moved = f"moved by the global check: the formulation ended at J = {look.before:.6g}"
+    if global_check.moved:
+        moved = f"moved by the global check: the formulation ended at J = {global_check.before:.6g}"
         return (known, moved, f"checked at {how}", gap), figures
     return (f"{known}, none better at {how}", gap), figures
 

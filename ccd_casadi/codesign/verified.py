@@ -141,12 +141,12 @@ class Verified(ABC):
         return ""
 
     def searched(
-        self, outcome: FormulationResult, look: GlobalCheck | None
+        self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
         """Where something better was looked for and not found, in clauses and figures."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return search_evidence(starts, optima, look, self.bound_words)
+        return search_evidence(starts, optima, global_check, self.bound_words)
 
     @cached_property
     def judgement(self) -> Judgement:

@@ -39,7 +39,7 @@ from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import HZ, counted, told_apart
+from ccd_casadi.support.text import HZ, counted, distinct_texts
 
 if TYPE_CHECKING:
     from ccd_casadi.fixed_structure.box_proof import Proof
@@ -120,7 +120,7 @@ class VerifiedStructured(Verified):
     costs: Costs
     prices: Mapping[str, float]
     gap: Gap | None
-    told: tuple[float, Yield | None] | None = None
+    reported: tuple[float, Yield | None] | None = None
     counterexamples: tuple[Scenario, ...] = ()
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
@@ -190,8 +190,8 @@ class VerifiedStructured(Verified):
             }
         if structured.uncertainty.ranges:
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
-        if self.told is not None:
-            time, drawn = self.told
+        if self.reported is not None:
+            time, drawn = self.reported
             found |= {"move_time": time, "move_time_fresh": None if drawn is None else drawn.entry}
         if structured.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
@@ -213,7 +213,7 @@ class VerifiedStructured(Verified):
         }
 
     def checks(self) -> dict[str, bool]:
-        drawn = None if self.told is None else self.told[1]
+        drawn = None if self.reported is None else self.reported[1]
         later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
         return {"robust": self.set_is_met, **later}
 
@@ -267,9 +267,9 @@ class VerifiedStructured(Verified):
         return super().bound_words if self.gap is None else self.gap.words(self.bandwidth)
 
     def searched(
-        self, outcome: FormulationResult, look: GlobalCheck | None
+        self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
-        known, figures = super().searched(outcome, look)
+        known, figures = super().searched(outcome, global_check)
         if self.multistart is None:
             return known, figures
         found, of = [optimum.bandwidth / HZ for optimum in self.optima], ""
@@ -286,4 +286,4 @@ class VerifiedStructured(Verified):
 
 def multistart_words(ends: Sequence[float]) -> str:
     """Where the searches of a multi-start search ended, in Hz, each apart from the others."""
-    return f"a multi-start search at this theta ended at {', '.join(told_apart(ends))} Hz"
+    return f"a multi-start search at this theta ended at {', '.join(distinct_texts(ends))} Hz"

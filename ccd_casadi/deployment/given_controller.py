@@ -145,8 +145,8 @@ def _from_mat(path: Path) -> tuple[StateSpace, float]:
                 raise UserError(f"{path}: {name}: has a delay in it; give the controller without")
             delay, beside = found.period, path.with_name("deploy.json")
             if found.period and beside.exists():
-                told = read_json(beside).get("delay")
-                delay = float(told) if isinstance(told, int | float) else delay
+                reported = read_json(beside).get("delay")
+                delay = float(reported) if isinstance(reported, int | float) else delay
             return found, delay
     raise UserError(f"{path}: holds no struct controller_discrete or controller")
 

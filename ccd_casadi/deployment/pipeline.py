@@ -135,9 +135,11 @@ def require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timi
     words = f"{run.folder}: channels have bounds of their own, which are judged as designed alone"
     if designed is None:
         raise UserError(f"{words}; give loop.rate_hz in the case, solve it and deploy that")
-    asked = timing.delay_at(timing.rate_hz or designed.rate_hz)
+    required = timing.delay_at(timing.rate_hz or designed.rate_hz)
     default = timing.delay is None and timing.delay_samples == Timing.delay_samples
-    if timing.rate_hz not in (None, designed.rate_hz) or not (default or asked == designed.delay):
+    if timing.rate_hz not in (None, designed.rate_hz) or not (
+        default or required == designed.delay
+    ):
         raise UserError(f"{words}; leave out the rate and the delay, which are then the case's")
 
 

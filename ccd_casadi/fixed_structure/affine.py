@@ -288,8 +288,8 @@ def moving_modes(
     top, gap = (size + m)[:, None, :], np.abs(away) - m[:, None, :]
     A = E + F * -lam[:, None, :]
     second = A.rest + F.size * m[:, None, :] + E.size @ rho + (F.size @ rho) * top
-    bent = A.reach * m[:, None, :] / np.abs(away)
-    vectors = Affine(shapes * 0.0 + eye, -A.slope / away, (second + bent) / gap)
+    bending = A.reach * m[:, None, :] / np.abs(away)
+    vectors = Affine(shapes * 0.0 + eye, -A.slope / away, (second + bending) / gap)
     read, drive = (product("Npk,Nki->Ni", product(how, f, modes), vectors)
                    for how, f in (("Npk,Nki->Npi", c), ("Nkp,Nki->Npi", b)))  # fmt: skip
     length = product("Nki,Nki->Ni", vectors, product("Njk,Nki->Nji", M, vectors))

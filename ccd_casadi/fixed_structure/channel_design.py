@@ -34,7 +34,7 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, run_race, started
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, search_from_starts, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -186,7 +186,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     if not field:
         return search.failed()
     tell = titled(search.tell, "whole loop")
-    runners = run_race(problem, np.array(field), tell, search.workers, known=known,
+    runners = search_from_starts(problem, np.array(field), tell, search.workers, known=known,
                        options=search.options.multi_start)  # fmt: skip
     return search.concluded(runners, len(field), evaluations)
 

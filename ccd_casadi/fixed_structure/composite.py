@@ -311,7 +311,7 @@ def _(
 ) -> Array:
     k, n = len(beside), len(kappa)
 
-    def bent(numbered: tuple[int, tuple[Part, np.ndarray, Constraints]]) -> Array:
+    def bending(numbered: tuple[int, tuple[Part, np.ndarray, Constraints]]) -> Array:
         number, (part, _, own) = numbered
         place = np.concatenate([np.arange(k), k + part.place, [k + n]])
         spread = np.asarray(np.arange(k + n + 1) == place[:, None], float)
@@ -320,7 +320,7 @@ def _(
         return np.asarray(spread.T @ inner @ spread)
 
     out, splits = np.zeros((len(rows.v), k + n + 1, k + n + 1)), problem.split(rows)
-    found = _by_parts(bent, list(enumerate(splits)))
+    found = _by_parts(bending, list(enumerate(splits)))
     for (_, at, _), own in zip(splits, found, strict=True):
         out[at] = own
     return out

@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     finished,
     local_optima,
     reinserted,
-    run_race,
+    search_from_starts,
 )
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
@@ -316,29 +316,33 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         pool = np.concatenate([pool, _pool(problem, starts, rng, workers, options)])
     if not len(pool):
         return search.failed()
-    last, begun = search.only_initial, len(pool)
-    first = run_race(problem, pool, search.tell, workers, known=known, last=last, options=rules)
+    last, started = search.only_initial, len(pool)
+    first = search_from_starts(
+        problem, pool, search.tell, workers, known=known, last=last, options=rules
+    )
     if last:
-        return search.concluded(first, begun)
+        return search.concluded(first, started)
     runners = _reworked(search, problem, first, rng)
     # known ones may be alike
     found, batch = arrivals(first, runners[0], rules) - max(known - 1, 0), 0
     least = min(options.least_starts, search.most_starts)
-    while begun < least or (found < options.repeats and begun + starts <= search.most_starts):
+    while started < least or (found < options.repeats and started + starts <= search.most_starts):
         if ends_early("controller start", starts):
             break
         batch += 1
         rng = np.random.default_rng((search.seed, batch))
         pool = _pool(problem, starts, rng, workers, options)
-        begun += len(pool)
+        started += len(pool)
         before, best = arrivals(runners, runners[0], rules), runners[0]
-        field = run_race(problem, pool, search.tell, workers, runners, last=False, options=rules)
+        field = search_from_starts(
+            problem, pool, search.tell, workers, runners, last=False, options=rules
+        )
         if field[0].merit > best.merit + rules.same:
             runners = _reworked(search, problem, field, rng)
             found = arrivals(field, runners[0], rules)
         else:
             runners, found = field, found + max(arrivals(field, field[0], rules) - before, 0)
-    return replace(search.concluded(runners, begun), found=found)
+    return replace(search.concluded(runners, started), found=found)
 
 
 def _reworked(
@@ -359,7 +363,7 @@ def _reworked(
         more, like = count - len(moved), [end.kappa for end in ends]
         drawn = stabilising(problem, redrawn(problem, like, options.pool // 2 * more, rng))
         pool = np.concatenate([moved, _nearest(problem, drawn, more, workers, options.batch)])
-        runners = run_race(problem, pool, search.tell, workers, runners, known=len(moved),
+        runners = search_from_starts(problem, pool, search.tell, workers, runners, known=len(moved),
                            options=options.multi_start)  # fmt: skip
         if runners[0].merit < best + options.multi_start.same:
             break

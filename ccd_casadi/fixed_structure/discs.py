@@ -135,8 +135,8 @@ def quotient(
     along = N.slope / np.where(size == 0.0, 1.0, N.centre)
     longer, aside = (np.abs(part).sum(0) + N.rest / size for part in (along.real, along.imag))
     grown = np.hypot(1.0 + longer, aside)
-    bent = np.where(longer < 1.0, aside / np.where(longer < 1.0, 1.0 - longer, 1.0), np.inf)
-    touching = size * half * grown * (1.0 + bent)
+    bending = np.where(longer < 1.0, aside / np.where(longer < 1.0, 1.0 - longer, 1.0), np.inf)
+    touching = size * half * grown * (1.0 + bending)
     chosen = ~(outer <= touching)
     edge = N.centre * turns[best].conj() * half * grown
     moves = D.reaches / np.where(chosen, d, D.middle) + np.abs(along)

@@ -360,11 +360,11 @@ def hessians(
     out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]
     # The room of a shape opens with ω/ω_b: c_ττ, and c_xτ = -c_ττ but for the warped frequency.
     closed = problem.closed(rows, tau)
-    bent = 4.0 * closed / (1.0 - closed) ** 2
-    c_xt = -bent * problem.plants.chain(rows.v)
+    bending = 4.0 * closed / (1.0 - closed) ** 2
+    c_xt = -bending * problem.plants.chain(rows.v)
     out[:, -1, :-1] += c_xt[:, None] * shift
     out[:, :-1, -1] += c_xt[:, None] * shift
-    out[:, -1, -1] += bent + c_xt**2 / np.where(top, -c_xx, np.inf)
+    out[:, -1, -1] += bending + c_xt**2 / np.where(top, -c_xx, np.inf)
     if end.any():
         chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
         out[end, :-1, -1] = out[end, -1, :-1] = chain[:, None] * c_xy[end]

@@ -144,7 +144,7 @@ class SearchRun(Ascent):
         return self.point.merit()
 
 
-def run_race(
+def search_from_starts(
     problem: LoopProblem,
     pool: Array,
     tell: Tell,

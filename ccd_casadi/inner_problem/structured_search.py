@@ -44,7 +44,7 @@ class StructuredSearchOptions:
     fastest: float = 30.0  # of K's frequencies, over the fastest pole at the start
 
 
-def race(
+def search_starts(
     problem: CoDesignProblem,
     theta: Sequence[float],
     tell: Tell = silent,
@@ -140,13 +140,13 @@ def prepared(
     worst : Excess or None
         The worst plant for the design, where it was searched.
     """
-    asked = structured_of(problem).minimise
+    required = structured_of(problem).minimise
     problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
     scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
     problem = with_structured(problem, scenarios=scenarios)
 
-    made = race(problem, problem.start, tell, workers, only_warm_starts, options)
+    made = search_starts(problem, problem.start, tell, workers, only_warm_starts, options)
     worst: Excess | None = None
     last = True  # a search that ended off its optimum continues once no plant is found worse
     for turn in range(options.rounds if made.certified else 0):
@@ -158,7 +158,7 @@ def prepared(
         last = wider is None
         problem = with_structured(wider or problem, warm_starts=_warm_starts(made, options))
         if not last:
-            made = race(problem, problem.start, tell, workers, True, options)
+            made = search_starts(problem, problem.start, tell, workers, True, options)
         if last or not made.certified:  # which has a few starts more where warm ones lead to none
             made = structured_value(problem, problem.start, workers).design
         worst = None
@@ -166,7 +166,7 @@ def prepared(
             break
     if made.certified:
         problem = with_structured(problem, warm_starts=_warm_starts(made, options))
-    return with_structured(problem, minimise=asked), made, worst
+    return with_structured(problem, minimise=required), made, worst
 
 
 def _wider(

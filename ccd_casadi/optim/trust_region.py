@@ -345,12 +345,12 @@ def best_step(
     weight = options.elastic_penalty * (unit + penalty) if model.growing else penalty
     multipliers = np.zeros(len(rows.value))
 
-    curved, bent = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
+    curved, bending = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
 
     def gains(ends: Array) -> Array:
         """Of merit at p (k, n), with what is known of the curvature of the rows."""
         level = value + ends @ slopes.T
-        level[:, bent] += 0.5 * ((ends @ curved) * ends).sum(axis=2).T
+        level[:, bending] += 0.5 * ((ends @ curved) * ends).sum(axis=2).T
         most = level[:, soft].max(axis=1, initial=-np.inf if model.carried else 0.0)
         curve = 0.5 * ((ends @ H) * ends).sum(axis=1)
         return np.asarray(penalty * (here.violation - most) - ends @ here.gradient - curve)
@@ -382,18 +382,18 @@ def best_step(
         if model.bending:
             moved = np.abs(slopes) @ np.abs(found[0])
             counts |= offset + at @ found[0] > -options.bends * moved
-        counts[bent] = False
+        counts[bending] = False
         fresh = np.flatnonzero(counts & (chosen < rows.curved))
         if len(fresh) and rows.hessians is not None:
             curved = np.concatenate([curved, rows.hessians(chosen[fresh])])
-            bent = np.concatenate([bent, fresh])
+            bending = np.concatenate([bending, fresh])
         size = float(np.abs(way).max())
         # The rows bend less on part of the way: a whole one may lead further and further out.
         tried = p + np.array(shares if rows.curved else shares[:1])[:, None] * way
         known, *reached = gains(np.vstack([p, tried])).tolist()
         if turn and reached[0] < max(reached):  # the whole of it, with what the rows bend on it
             bends = offset.copy()
-            bends[bent] += 0.5 * (curved @ way) @ way
+            bends[bending] += 0.5 * (curved @ way) @ way
             if (other := answer(bends)) is not None:
                 tried = np.vstack([tried, other[0]])
                 reached += gains(other[0][None]).tolist()
@@ -409,9 +409,9 @@ def best_step(
         if rows.curved:
             bend = curved @ p
             at, offset = at if turn else slopes.copy(), value.copy()
-            at[bent] = slopes[bent] + bend
-            offset[bent] -= 0.5 * bend @ p
-            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bent], curved)
+            at[bending] = slopes[bending] + bend
+            offset[bending] -= 0.5 * bend @ p
+            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bending], curved)
             active = at[holds]
             M = convex(lagrangian + options.convexifying * active.T @ active, options.flat * unit)
         best = Step(p, predicted, straight, M, multipliers, rows, penalty)

@@ -169,11 +169,11 @@ def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[Before
     """Hardware, cost, figure of the objective and first resonances at the start and the optimum."""
     result, problem = run.result, run.problem
     started = result.get("start") or {}
-    for name, unit, begun in zip(problem.names, problem.units, problem.start, strict=True):
+    for name, unit, before_value in zip(problem.names, problem.units, problem.start, strict=True):
         value = result["theta"][name]
-        shown, factor = display_unit(unit, max(abs(value), abs(begun)))
-        before, after = (f"{number(factor * v)} {shown}".strip() for v in (begun, value))
-        yield BeforeAfter(name, before, after, _change(begun, value))
+        shown, factor = display_unit(unit, max(abs(value), abs(before_value)))
+        before, after = (f"{number(factor * v)} {shown}".strip() for v in (before_value, value))
+        yield BeforeAfter(name, before, after, _change(before_value, value))
     for name, value in result.get("fixed", {}).items():
         shown, factor = display_unit(problem.parameter_units[name], value)
         words = f"{number(factor * value)} {shown}".strip()

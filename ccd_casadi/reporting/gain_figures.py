@@ -159,7 +159,7 @@ def S_panel(view: LoopView) -> Panel:
         top = float(view.hz[i]), float(view.sizes[0].max())
         worst = _peak_marks([top], GREEN, ", worst plant")
         marks = (*(replace(mark, offset=(0.0, -14.0)) for mark in marks), *worst)
-    return _gain_panel([view], 0, view.bounded.asked, marks=marks)
+    return _gain_panel([view], 0, view.bounded.required, marks=marks)
 
 
 def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) -> Panel:
@@ -177,8 +177,8 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
             curves.append(Curve(view.hz, size.max(axis=0), label, colour))
         if bounds and np.isfinite(bound).any():
             words = view.bounded.words[i] if alone else ""
-            look = ORANGE if view.bounded.asked and alone else colour
-            curves.append(Curve(view.hz, bound, words, look, "--", width=0.9))
+            colour_of_bound = ORANGE if view.bounded.required and alone else colour
+            curves.append(Curve(view.hz, bound, words, colour_of_bound, "--", width=0.9))
         if i == 0:
             marks += _peak_marks(_high_peaks(view), colour)
     at = [bandwidth_level(view.bandwidth_hz, GREY if alone else colour)
@@ -194,10 +194,10 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
         if alone:
             top = 3.5 * max(b.S_max, float(high))  # room for the words at its peak
             found["y_range"] = (0.5 * float(first.sizes[0, 0].min()), top)
-            shape = (first.hz, first.bounds[0]) if b.asked else None
+            shape = (first.hz, first.bounds[0]) if b.required else None
             found["forbidden"] = forbidden(b.S_max, b.S_low, b.low_hz, *ends, top, shape)
         return sensitivity_panel(curves, ends, b.S_max, at, label, **{**found, **more})
-    if alone and first.bounded.asked:
+    if alone and first.bounded.required:
         found["forbidden"] = above(first.hz, first.bounds[i], found["y_range"][1])
     bare = [Level(level.value, "", True, level.colour) for level in at]
     return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
@@ -274,10 +274,10 @@ def forbidden(
 
 def above(hz: Array, bound: Array, top: float) -> tuple[Area, ...]:
     """Where a gain may not be, over Hz: above a bound that is NaN where nothing is asked."""
-    asked = np.isfinite(bound) & (bound < top)
-    if not asked.any():
+    required = np.isfinite(bound) & (bound < top)
+    if not required.any():
         return ()
-    x, y = hz[asked], bound[asked]
+    x, y = hz[required], bound[required]
     return (Area(np.append(x, [x[-1], x[0]]), np.append(y, [top, top])),)
 
 

@@ -70,8 +70,8 @@ def history_blocks(
     stays = bool(met.size and (error[met[0] : -1] <= tolerance).all())
     first = int(met[0]) + 1 if met.size else 0
     lost = int(np.isnan(objective).sum())
-    told = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
-    return Words(paragraph("report.history", *told)), table
+    shown = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
+    return Words(paragraph("report.history", *shown)), table
 
 
 def trust_figure(qualities: Sequence[Quality]) -> Figure:
@@ -347,5 +347,5 @@ def slices_figure(
     lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
     most = max(spans.items(), key=lambda item: item[1][0], default=None)
     band = max((half for _, half in spans.values()), default=0.0)
-    told = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
-    return Figure(lines, paragraph("report.slices", *told) + extra)
+    shown = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
+    return Figure(lines, paragraph("report.slices", *shown) + extra)

@@ -100,17 +100,17 @@ def cycle_chapter(
 ) -> list[c.Chapter]:
     """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
     that is allowed; nothing for a case without a motor."""
-    own, told = problem.source.motion, result.get("move")
-    if own is None or own.motor is None or not told:
+    own, shown = problem.source.motion, result.get("move")
+    if own is None or own.motor is None or not shown:
         return []
     found, motor = motion_of(problem, theta), own.motor
-    profile, forces, settled = found.cycle.profile, found.forward[2], told["settled_latest"]
+    profile, forces, settled = found.cycle.profile, found.forward[2], shown["settled_latest"]
     k, R, _ = motor.at(found.mass)
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
     force = profile.at(time).T @ found.forward
     heat = R / k**2 * (np.outer(profile.at(time)[2], forces) ** 2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
-    mean = c.Level(told["power"], "mean")
+    mean = c.Level(shown["power"], "mean")
     ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration
     panels = [
         c.Panel("time (ms)", "force of a motor (N)", (c.Curve(ms, force[:, 0]),), levels=(end,)),
@@ -118,17 +118,17 @@ def cycle_chapter(
         c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
     if not own.required:
-        watts = told["power"] * np.linspace(0.1, 2.0, 39)
+        watts = shown["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
         times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
         curve = c.Curve(watts, 1e3 * (np.array(times) + late))
-        here = c.Level(told["power"], "this design", vertical=True)
+        here = c.Level(shown["power"], "this design", vertical=True)
         panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
                               levels=(here,)))  # fmt: skip
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
     known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required)
-    words = paragraph("report.cycle", told, *known)
+    words = paragraph("report.cycle", shown, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 

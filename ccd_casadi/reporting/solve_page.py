@@ -253,7 +253,7 @@ def _loop(
 ) -> list[c.Chapter]:
     channels = scalar_channels(scaled_plant(problem, theta), loop.loop.controller)
     plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),), folded=True)
-    if loop.bounded.asked:  # of a fixed structure
+    if loop.bounded.required:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
         c.Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),

@@ -82,8 +82,8 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
         (f"sections: the design{least}", whole, loop, hz(result["bandwidth_hz"])),
     ]
     most = sorted(costs.get("tolerances_hz", {}).items(), key=lambda item: item[1])
-    told = [item for item in most[:MOST_TOLERANCES] if item[1] < -LEAST_HZ]
-    words = Words(paragraph("report.costs", told))
+    shown = [item for item in most[:MOST_TOLERANCES] if item[1] < -LEAST_HZ]
+    words = Words(paragraph("report.costs", shown))
     return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), words
 
 

@@ -33,7 +33,7 @@ class SynthesisCounts:
     """
 
     def __init__(self, workers: Pool | None = None) -> None:
-        self.purpose, self.told = "samples", np.inf
+        self.purpose, self.reported = "samples", np.inf
         self._units: dict[str, tuple[str, int]] = {}
         self._workers, self._seconds = workers, dict[str, Array]()
         self._since = self._clocks()

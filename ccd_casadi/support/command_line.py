@@ -157,8 +157,8 @@ def parser(
                            "help": "refuse a case whose plant is a Python function"},
     }  # fmt: skip
     for name, how in shared.items():
-        told = argparse.SUPPRESS if name in without_effect else how["help"]
-        result.add_argument(name, **how | {"help": told})
+        reported = argparse.SUPPRESS if name in without_effect else how["help"]
+        result.add_argument(name, **how | {"help": reported})
     return result
 
 

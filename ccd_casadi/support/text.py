@@ -256,7 +256,7 @@ def number(value: Any, digits: int = 5) -> str:
     return f"{float(value):.{digits}g}"
 
 
-def told_apart(values: Sequence[float], digits: int = 4) -> list[str]:
+def distinct_texts(values: Sequence[float], digits: int = 4) -> list[str]:
     """Write numbers with as many digits as keep unequal ones apart, six more than `digits` at most.
 
     Parameters

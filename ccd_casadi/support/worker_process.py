@@ -204,7 +204,7 @@ class WorkerProcess:
             self.pipe.send_bytes(message)
 
     def answer(
-        self, seconds: float | None = None, told: Callable[[str], None] = lambda words: None
+        self, seconds: float | None = None, reported: Callable[[str], None] = lambda words: None
     ) -> tuple[bool, Any]:
         """(True, what the task came to) or (False, what it raised); `told` hears what it tells.
 
@@ -215,7 +215,7 @@ class WorkerProcess:
                 done, value = pickle.loads(self.pipe.recv_bytes())  # our own child wrote it
                 if done is not None:
                     return done, value
-                told(value)
+                reported(value)
             raise Overrun(f"no answer within {seconds:g} s")
         except (EOFError, OSError):
             self.process.join(1.0)

@@ -30,13 +30,13 @@ def beam(theta, zeta=0.01, volume=0.3):
     height = theta["guide"] + (theta["tip"] - theta["guide"]) * ca.DM(xi)
     found = shapes()
     value = ca.DM(np.array([shape(xi) for shape in found]))
-    bent = ca.DM(np.array([shape.deriv(2)(xi) for shape in found]))
+    bending = ca.DM(np.array([shape.deriv(2)(xi) for shape in found]))
     line = DENSITY * DEPTH * LENGTH * height * ca.DM(weights)
     stiff = MODULUS * DEPTH / 12.0 / LENGTH**3 * height**3 * ca.DM(weights)
     mean = 0.5 * (theta["guide"] + theta["tip"])
     return {
         "mass": value @ ca.diag(line) @ value.T,
-        "stiffness": bent @ ca.diag(stiff) @ bent.T,
+        "stiffness": bending @ ca.diag(stiff) @ bending.T,
         "damping_ratio": zeta,
         "input": ca.DM([shape(0.0) for shape in found]),
         "output": ca.DM([[shape(1.0) for shape in found]]),

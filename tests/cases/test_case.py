@@ -235,10 +235,10 @@ def test_theta_of_the_command_line(text: str, theta: tuple[float, ...]) -> None:
 def test_wrong_theta_of_the_command_line(text: str, words: str) -> None:
     with pytest.raises(CaseError) as caught:
         parse_theta(load_case(TWO_MASS), text)
-    told = str(caught.value)
-    assert told.startswith(f"{TWO_MASS}: --theta: ")
-    assert words in told
-    assert told.isprintable()
+    reported = str(caught.value)
+    assert reported.startswith(f"{TWO_MASS}: --theta: ")
+    assert words in reported
+    assert reported.isprintable()
 
 
 def test_another_package_offers_a_plant_by_its_entry_point(

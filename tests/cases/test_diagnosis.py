@@ -132,8 +132,8 @@ def test_a_zero_in_the_right_half_plane_is_a_warning(tmp_path: Path) -> None:
     assert "right half-plane" in words[0]
     # 10 X2/F - 9 X1/F = 0 at s² = k/(9 m2), damping neglected: lowest at the heaviest m2, once
     hz = (2e8 / 9 / 70.0) ** 0.5 / 6.283185307
-    told = float(words[0].split("half-plane at ")[1].split()[0])
-    assert told == pytest.approx(hz, rel=5e-3)
+    reported = float(words[0].split("half-plane at ")[1].split()[0])
+    assert reported == pytest.approx(hz, rel=5e-3)
     assert "m2=70" in words[0]
     assert sum("right half-plane" in text for text in words) == 1
 
@@ -351,13 +351,15 @@ def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
         ("|{'constraints': {'c': t['foo'] - 2}}", False),
     ],
 )
-def test_a_parameter_that_changes_nothing_is_told(tmp_path: Path, uses: str, told: bool) -> None:
+def test_a_parameter_that_changes_nothing_is_reported(
+    tmp_path: Path, uses: str, reported: bool
+) -> None:
     path = case_file(tmp_path, GOOD + uses)
     path.write_text(path.read_text() + "\n[theta.foo]\nlower = 1.0\nupper = 2.0\n")
     found = [item.words for item in diagnose(problem_of(load_case(path)))[1]
              if item.topic is Topic.UNUSED]  # fmt: skip
-    assert len(found) == told
-    assert not told or "theta.foo changes nothing" in found[0]
+    assert len(found) == reported
+    assert not reported or "theta.foo changes nothing" in found[0]
 
 
 def test_what_varies_is_looked_at_to_its_ends() -> None:

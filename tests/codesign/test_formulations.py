@@ -49,11 +49,11 @@ def chain(theta, masses):
 """
 
 
-def stands_in(asked: list) -> Callable[..., Solution]:
+def stands_in(required: list) -> Callable[..., Solution]:
     """In the place of a run: it notes the formulation."""
 
     def co_design(_: object, formulation: object, __: object) -> Solution:
-        asked.append(formulation)
+        required.append(formulation)
         return Solution({}, None, None)  # type: ignore[arg-type]
 
     return co_design
@@ -106,23 +106,23 @@ def test_the_usual_formulation_has_an_end() -> None:
 def test_a_script_gets_one_that_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, masses: int, expected: type
 ) -> None:
-    asked = []
-    monkeypatch.setattr(run, "co_design", stands_in(asked))
+    required = []
+    monkeypatch.setattr(run, "co_design", stands_in(required))
     run.solve(chain_of(masses, tmp_path))
-    assert [type(item) for item in asked] == [expected]
+    assert [type(item) for item in required] == [expected]
 
 
 def test_a_script_gets_the_formulation_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the options of the case, and those of a case without such tables for a problem."""
-    asked = []
-    monkeypatch.setattr(run, "co_design", stands_in(asked))
+    required = []
+    monkeypatch.setattr(run, "co_design", stands_in(required))
     own = replace(CASE, sampling=replace(CASE.sampling, points=4))
     for given in (own, problem_of(own)):
         run.solve(given)
     bare = {key: table for key, table in tomllib.loads(CASE.path.read_text("utf-8")).items()
             if key not in ("sampling", "outer")}  # fmt: skip
     plain = parse_case(bare, CASE.path)
-    assert asked == [formulation_of(case, usual_name(case, 2)) for case in (own, plain)]
+    assert required == [formulation_of(case, usual_name(case, 2)) for case in (own, plain)]
 
 
 @pytest.mark.parametrize(
@@ -174,14 +174,14 @@ def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
     """A sliver that one θ of the plan lies in; narrower than any step, it is the design."""
     case = problem()
     centre, width = np.array([55.0, 62.5]), np.array([15.0, 15.0])
-    asked: list[tuple[float, ...]] = []
+    required: list[tuple[float, ...]] = []
 
     def values(thetas: np.ndarray, *_: object) -> list[InnerSample]:
         found = []
         for theta in map(tuple, np.atleast_2d(thetas).tolist()):
             inside = np.abs((theta - centre) / width).max() < reach
             value = 400.0 + theta[1] if inside else np.nan
-            asked.append(theta)
+            required.append(theta)
             found.append(InnerSample(theta, value, (0.0, 1.0), 1e3, 1e2, (), "", 0.0, 1))
         return found
 
@@ -190,7 +190,7 @@ def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
     )
     options = Nested(points=3, starts=4, max_refinements=3)
     found = solve_nested(sampler, options, seed=0)  # type: ignore[arg-type]
-    assert len(asked) > 10 + 5  # the plan and the start, then around what is feasible
+    assert len(required) > 10 + 5  # the plan and the start, then around what is feasible
     assert found.x is not None
     assert np.abs((found.x[:2] - centre) / width).max() < reach
     assert bool(found.surrogates) is (reach > 0.1)

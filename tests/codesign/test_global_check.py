@@ -50,10 +50,10 @@ def test_the_way_to_one_optimum_is_no_look_at_the_rest_of_the_box() -> None:
         return Place(np.array(end.theta), objective_of(case, end), True)
 
     path = [sample(lower + share * low * (upper - lower)) for share in np.linspace(0.0, 1.0, 9)]
-    look = looked(case, path, sample, local_solve)
-    assert look.moved
-    assert look.x == pytest.approx(lower + high * (upper - lower))
-    assert look.points <= len(path) + 8
+    global_check = looked(case, path, sample, local_solve)
+    assert global_check.moved
+    assert global_check.x == pytest.approx(lower + high * (upper - lower))
+    assert global_check.points <= len(path) + 8
 
 
 def looked(
@@ -83,10 +83,10 @@ def test_an_end_of_a_range_that_is_little_worse_leads_on(worse: float) -> None:
         value = 300.0 * (1.0 - worse * float(np.abs((theta - lower) / (upper - lower)).max()))
         return InnerSample(tuple(theta), value, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
 
-    begun: list[float] = []
+    started: list[float] = []
 
     def local_solve(start: InnerSample, _: object) -> None:
-        begun.append(max(np.subtract(start.theta, lower) / (upper - lower)))
+        started.append(max(np.subtract(start.theta, lower) / (upper - lower)))
 
     looked(case, [sample(lower)], sample, local_solve)
-    assert (1.0 in begun) == (worse < 0.03)
+    assert (1.0 in started) == (worse < 0.03)

@@ -40,10 +40,10 @@ class Pieces:
 
     def at(self, z: np.ndarray) -> Local:
         d = z - self.minimiser
-        bent = self.curvature @ d
-        value = J0 + self.slopes @ d + 0.5 * bent @ d
+        bending = self.curvature @ d
+        value = J0 + self.slopes @ d + 0.5 * bending @ d
         i = int(np.argmax(value))
-        return Local(z, float(value[i]), self.slopes[i] + bent[i])
+        return Local(z, float(value[i]), self.slopes[i] + bending[i])
 
     def constraints(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.A @ (z - self.minimiser), self.A
@@ -56,13 +56,13 @@ class Pieces:
         return z
 
 
-def pieces(rng: np.random.Generator, n: int, count: int, bound: bool, bent: float) -> Pieces:
+def pieces(rng: np.random.Generator, n: int, count: int, bound: bool, bending: float) -> Pieces:
     g = rng.normal(size=(count, n))
     A = rng.normal(size=(int(bound), n))
     mu = rng.dirichlet(np.full(count, 3.0))
     g -= mu @ g + rng.uniform(0.5, 1.0, int(bound)) @ A
     roots = rng.normal(size=(count, n, n))
-    Q = bent * rng.uniform(0.3, 3.0, (count, 1, 1)) * roots @ roots.transpose(0, 2, 1)
+    Q = bending * rng.uniform(0.3, 3.0, (count, 1, 1)) * roots @ roots.transpose(0, 2, 1)
     return Pieces(rng.uniform(0.2, 0.8, n), g, Q, A)
 
 
@@ -263,12 +263,13 @@ class Told:
         return [self.at(theta) for theta in np.atleast_2d(thetas)]
 
 
-def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate:
+def certificate(reported: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate:
     """At z, where all pieces with these slopes are equal."""
-    lower, width = np.array(told.case.lower), np.subtract(told.case.upper, told.case.lower)
+    lower = np.array(reported.case.lower)
+    width = np.subtract(reported.case.upper, lower)
     envelope = replace(envelope_of(slopes), to_theta=-slopes / width)
-    sample = replace(told.at(lower + width * z), gradient=tuple(-slopes[0] / width))
-    return theta_kkt(told.case, sample, cast(Sampler, told), envelope)
+    sample = replace(reported.at(lower + width * z), gradient=tuple(-slopes[0] / width))
+    return theta_kkt(reported.case, sample, cast(Sampler, reported), envelope)
 
 
 def case() -> CoDesignProblem:
@@ -327,10 +328,10 @@ def test_another_controller_that_is_better_beside_it_refuses_a_kink() -> None:
         np.array([0.4, 0.6]), np.array([[30.0, 0.0], [-20.0, 0.0]]),
         np.array([np.eye(2), np.eye(2)]), np.zeros((0, 2)),
     )  # fmt: skip
-    told = Told(case(), of)
-    assert line(certificate(told, of.minimiser, of.slopes)).state is State.PASSED
-    told.worth = 45.0
-    found = certificate(told, of.minimiser, of.slopes)
+    reported = Told(case(), of)
+    assert line(certificate(reported, of.minimiser, of.slopes)).state is State.PASSED
+    reported.worth = 45.0
+    found = certificate(reported, of.minimiser, of.slopes)
     assert found.stationarity < 1e-9
     assert found.kink is not None
     assert found.kink.least_slope == pytest.approx(-0.5, rel=1e-2)
@@ -343,10 +344,10 @@ def test_where_one_gradient_is_enough_there_is_no_kink() -> None:
     """Two equal rows have many multipliers, and one gradient."""
     of = Pieces(np.array([0.4, 0.6]), np.zeros((1, 2)), np.array([np.eye(2)]), np.zeros((0, 2)))
     slopes = np.array([[5.0, 3.0], [5.0, 3.0]])
-    told = Told(case(), of)
-    found = certificate(told, of.minimiser, slopes)
+    reported = Told(case(), of)
+    found = certificate(reported, of.minimiser, slopes)
     assert found.kink is None
     assert found.stationarity == pytest.approx(1.0)
-    smooth = certificate(told, of.minimiser, np.zeros((2, 2)))
+    smooth = certificate(reported, of.minimiser, np.zeros((2, 2)))
     assert smooth.kink is None
     assert smooth.stationarity <= VerifiedStructured.kkt_level

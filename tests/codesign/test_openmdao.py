@@ -50,65 +50,66 @@ def largest_error(found: Any) -> float:
 
 @pytest.mark.parametrize("compliance_max", [None, 1e-4])
 def test_the_partials_of_a_synthesis_are_exact(compliance_max: float | None) -> None:
-    asked = problem()
-    asked = replace(asked, inner=replace(asked.inner, compliance_max=compliance_max))
+    required = problem()
+    required = replace(required, inner=replace(required.inner, compliance_max=compliance_max))
     omega = (800.0 * HZ, 40.0 * HZ)
     weights = dict(zip(("ln_omega_S", "ln_omega_T"), np.log(omega), strict=True))
-    found = at(CertifiedLoop(problem=asked), {"m1": 60.0, "m2": 58.0} | weights)
+    found = at(CertifiedLoop(problem=required), {"m1": 60.0, "m2": 58.0} | weights)
     assert largest_error(found) < 1e-5
-    figures = ccd.true_design(asked, (60.0, 58.0), *omega).figures
+    figures = ccd.true_design(required, (60.0, 58.0), *omega).figures
     assert found.get_val("bandwidth").item() == pytest.approx(figures.bandwidth, rel=1e-9)
-    bounded = asked.inner.bounds.values()
+    bounded = required.inner.bounds.values()
     assert len(bounded) == 2 + (compliance_max is not None)
     for name, _ in bounded:
         assert found.get_val(name).item() == pytest.approx(getattr(figures, name), rel=1e-9)
 
 
 def test_a_plant_gives_its_constraints_and_a_model_is_told_the_bounds() -> None:
-    asked = ccd.problem_of(ccd.load_case(ROOT / "examples/three_mass_axis/case.toml"))
+    required = ccd.problem_of(ccd.load_case(ROOT / "examples/three_mass_axis/case.toml"))
     found = om.Problem(reports=False)
-    found.model.add_subsystem("loop", CertifiedLoop(problem=asked), promotes=["*"])
-    pose(found.model, asked)
+    found.model.add_subsystem("loop", CertifiedLoop(problem=required), promotes=["*"])
+    pose(found.model, required)
     found.model.add_objective("hardware_cost")
     found.setup()
     found.run_model()
-    plant = plant_of(asked)
-    np.testing.assert_allclose(found.get_val("constraints"), constraint_values(plant, asked.start))
-    slopes = found.compute_totals(["hardware_cost", "constraints"], list(asked.names))
-    d, h = np.array(asked.start), 1e-6 * np.array(asked.start)
-    for i, name in enumerate(asked.names):
+    plant = plant_of(required)
+    own = constraint_values(plant, required.start)
+    np.testing.assert_allclose(found.get_val("constraints"), own)
+    slopes = found.compute_totals(["hardware_cost", "constraints"], list(required.names))
+    d, h = np.array(required.start), 1e-6 * np.array(required.start)
+    for i, name in enumerate(required.names):
         step = h * np.eye(len(h))[i]
         for output, of in (("hardware_cost", hardware_cost), ("constraints", constraint_values)):
             change = (np.array(of(plant, d + step)) - of(plant, d - step)) / (2.0 * h[i])
             np.testing.assert_allclose(slopes[output, name].ravel(), change.ravel(), rtol=1e-6)
     bounds = found.model.get_design_vars()
-    for name, low, high in zip(asked.names, asked.lower, asked.upper, strict=True):
+    for name, low, high in zip(required.names, required.lower, required.upper, strict=True):
         assert (bounds[name]["lower"], bounds[name]["upper"]) == (low, high)
     assert {"ln_omega_S", "ln_omega_T"} < set(bounds)
     limits = found.model.get_constraints()
     assert set(limits) == {"sensitivity_peak", "sensitivity_low", "constraints"}
-    assert limits["sensitivity_peak"]["upper"] == asked.inner.S_max
+    assert limits["sensitivity_peak"]["upper"] == required.inner.S_max
 
 
 def test_the_partials_of_the_inner_problem_are_its_envelope() -> None:
-    asked = problem()
-    found = at(LargestBandwidth(problem=asked), {"m1": 60.0, "m2": 58.0})
+    required = problem()
+    found = at(LargestBandwidth(problem=required), {"m1": 60.0, "m2": 58.0})
     assert largest_error(found) < 1e-5
-    best = ccd.true_inner(asked, (60.0, 58.0))
+    best = ccd.true_inner(required, (60.0, 58.0))
     assert found.get_val("bandwidth").item() == best.bandwidth
 
 
 def test_what_is_not_certified_is_an_analysis_error() -> None:
-    asked = problem()
-    nothing = replace(asked, inner=replace(asked.inner, S_max=1.01))
+    required = problem()
+    nothing = replace(required, inner=replace(required.inner, S_max=1.01))
     with pytest.raises(om.AnalysisError, match="no certified design"):
         at(LargestBandwidth(problem=nothing), {})
 
 
 def test_a_fixed_structure_needs_its_anchors() -> None:
-    asked = ccd.problem_of(ccd.load_case(ROOT / "runs/two_mass_built.toml"))
+    required = ccd.problem_of(ccd.load_case(ROOT / "runs/two_mass_built.toml"))
     with pytest.raises(UserError, match="read_run"):
-        at(LargestBandwidth(problem=asked), {})
+        at(LargestBandwidth(problem=required), {})
 
 
 def test_the_example_ends_where_solve_does_and_moves_for_a_price(

@@ -130,7 +130,7 @@ def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_failed_programme_is_no_optimum_in_a_bundle(failing, count: int) -> None:
-    p = pieces(np.random.default_rng(0), 3, 3, bound=False, bent=0.3)
+    p = pieces(np.random.default_rng(0), 3, 3, bound=False, bending=0.3)
     met = [p.at(np.full(3, 0.35))]
 
     def at(z: np.ndarray) -> of_pieces.Local:

@@ -101,11 +101,11 @@ def test_a_verification_synthesises_every_design_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Polish, verification and the global check over the box ask the same truth."""
-    asked: list[tuple] = []
+    required: list[tuple] = []
     real = objective.true_design
 
     def counted(problem: CoDesignProblem, *where: Any) -> object:
-        asked.append(where)
+        required.append(where)
         return real(problem, *where)
 
     monkeypatch.setattr(objective, "true_design", counted)
@@ -116,4 +116,4 @@ def test_a_verification_synthesises_every_design_once(
         global_check(outer, end, 4, 0)
         verified = outer.verified(end, 1)
     assert verified.feasible
-    assert len(set(asked)) == len(asked)
+    assert len(set(required)) == len(required)

@@ -88,11 +88,11 @@ def test_a_tighter_tolerance_goes_on_from_the_samples(copy: Path) -> None:
 def test_an_interrupted_job_resumes(
     retrained: tuple[Path, RetrainingEnd, Solution], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, asked = Sampler.quantities, []
+    real, required = Sampler.quantities, []
 
     def dies(self: Sampler, X: Any, *label: str) -> Any:
-        asked.append(X)
-        if len(asked) == 3:
+        required.append(X)
+        if len(required) == 3:
             raise KeyboardInterrupt
         return real(self, X, *label)
 

@@ -108,7 +108,7 @@ def test_killed_at_random_it_ends_the_same(retrained: Path, tmp_path: Path) -> N
 def test_of_two_jobs_one_is_refused(retrained: Path, tmp_path: Path) -> None:
     folder = started_from(tmp_path / "run")
     both = [launched(folder) for _ in range(2)]
-    told = [process.communicate()[1] for process in both]
+    reported = [process.communicate()[1] for process in both]
     assert sorted(process.returncode for process in both) == [0, 2]
-    assert sorted(len(words.splitlines()) for words in told) == [0, 1]
+    assert sorted(len(words.splitlines()) for words in reported) == [0, 1]
     assert result(folder)["objective"] == pytest.approx(result(retrained)["objective"], rel=1e-6)

@@ -289,10 +289,10 @@ def test_other_damping_is_that_of_the_plant_given_the_other_way(
 
 
 def test_what_the_other_damping_would_pass_is_told() -> None:
-    told = OtherDamping("matrix", {"S_max": 1.0, "KS": 0.2}, {"S_max": 1.036, "KS": 0.5})
-    assert "with the damping ratio kept instead of the matrix: S by 3.6 %" in told.words
-    assert "KS" not in told.words
-    assert told.words in told.entry["damping_words"]
+    reported = OtherDamping("matrix", {"S_max": 1.0, "KS": 0.2}, {"S_max": 1.036, "KS": 0.5})
+    assert "with the damping ratio kept instead of the matrix: S by 3.6 %" in reported.words
+    assert "KS" not in reported.words
+    assert reported.words in reported.entry["damping_words"]
     assert not OtherDamping("ratio", {"S_max": 1.0}, {"S_max": 1.009}).words
     assert "unstable" in OtherDamping("ratio", {"S_max": 1.0}, {}).words
 

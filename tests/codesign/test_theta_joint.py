@@ -56,8 +56,8 @@ def test_what_the_first_order_leaves_out_is_of_second_order() -> None:
 
     def missed(share: float) -> float:
         there = mechanics(plant, tuple(np.array([60.0, 58.0]) + share * step))
-        told = to_first_order(here, share * step)
-        parts = [(there.K, told.K), (there.M, told.M), (there.B, told.B), (there.C, told.C)]
+        reported = to_first_order(here, share * step)
+        parts = [(getattr(there, name), getattr(reported, name)) for name in "KMBC"]
         return max(float(np.abs(a - b).max() / np.abs(a).max()) for a, b in parts)
 
     assert missed(1.0) < 1e-3
@@ -78,16 +78,16 @@ def curved(system: Mechanics, middle: tuple[float, ...]) -> Evaluate:
 
 @pytest.mark.parametrize(("direction", "bent"), [(0, False), (1, False), (2, False), (3, True)])
 def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
-    direction: int, bent: bool
+    direction: int, bending: bool
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
     problem, theta = built(), (60.0, 60.0)
     at = JointPoint(theta, stored, omega)
     models = nearby(problem, [theta], theta)
-    if bent:
+    if bending:
         models = (curved(mechanics(plant_of(problem), theta), theta),)
-    model = JointModel(problem, models, at, 0.1, curved_plants=bent)
+    model = JointModel(problem, models, at, 0.1, curved_plants=bending)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -116,9 +116,9 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
 
     up, down = there(1.0), there(-1.0)
     for j in range(len(chosen.v)):
-        bent = (same(up, j) - 2.0 * chosen.value[j] + same(down, j)) / e**2
-        told = float(d @ H[j] @ d)
-        assert told == pytest.approx(bent, rel=0.03, abs=0.03 * float(np.abs(H[j]).max()))
+        bending = (same(up, j) - 2.0 * chosen.value[j] + same(down, j)) / e**2
+        reported = float(d @ H[j] @ d)
+        assert reported == pytest.approx(bending, rel=0.03, abs=0.03 * float(np.abs(H[j]).max()))
 
 
 @pytest.mark.slow
@@ -145,9 +145,9 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         assert other.spent.total == spent
         # Beside it J is told by plants to first order as by true ones, but for their curvature.
         there = np.array(best.theta) + 0.03 * np.array([[1, 0], [0, 1], [1, 1]])
-        told = objectives_beside(problem, best, there)
+        reported = objectives_beside(problem, best, there)
         true = [objective_of(problem, one) for one in sampler.values(there)]
-        assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
+        assert reported == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
 
 
 @pytest.mark.parametrize("theta", [(60.0, 58.0), (55.0, 58.0)])

@@ -71,14 +71,14 @@ class Smooth(TrustRegionModel[Array]):
 
 
 def convex_problem(
-    rng: np.random.Generator, n: int, learn: Update | None, bent: float
+    rng: np.random.Generator, n: int, learn: Update | None, bending: float
 ) -> tuple[Smooth, Array]:
     """With the minimiser x*, at which some of the rows bind with multipliers from 0.5 to 2."""
     root = rng.normal(size=(n, n))
     Q, best = root @ root.T + 0.3 * np.eye(n), rng.uniform(-3.0, 3.0, n)
     m = int(rng.integers(1, n + 2))
     roots = rng.normal(size=(m, n, n))
-    R = bent * roots @ roots.transpose(0, 2, 1)
+    R = bending * roots @ roots.transpose(0, 2, 1)
     slopes = rng.normal(size=(m, n))
     mu = np.where(np.arange(m) < n, rng.uniform(0.5, 2.0, m), 0.0) * rng.integers(0, 2, m)
     slack = np.where(mu > 0.0, 0.0, rng.uniform(0.1, 1.0, m))
@@ -91,11 +91,11 @@ def convex_problem(
 @few(max_examples=20)
 @given(SEEDS, st.integers(1, 5), st.sampled_from([0.0, 0.3]))
 def test_a_convex_problem_ends_at_its_minimiser(
-    learn: Update | None, seed: int, n: int, bent: float
+    learn: Update | None, seed: int, n: int, bending: float
 ) -> None:
     """From a start that may be far outside the rows, whatever the curvature is learnt by."""
     rng = np.random.default_rng(seed)
-    model, best = convex_problem(rng, n, learn, bent)
+    model, best = convex_problem(rng, n, learn, bending)
     end = model.run(rng.uniform(-9.0, 9.0, n))
     assert end.best.violation <= 1e-7
     np.testing.assert_allclose(end.best.x, best, atol=1e-4)

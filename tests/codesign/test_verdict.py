@@ -65,10 +65,10 @@ SOUND = Survival(
 
 
 def optimal_line(
-    residual: float, gap: float = 0.0, look: GlobalCheck | None = None
+    residual: float, gap: float = 0.0, global_check: GlobalCheck | None = None
 ) -> v.VerdictLine:
     kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
-    known = v.search_evidence(16, 2, look)
+    known = v.search_evidence(16, 2, global_check)
     return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", searched=known)
 
 
@@ -91,11 +91,12 @@ def test_a_better_inner_design_fails_the_line() -> None:
 
 
 def test_the_look_at_the_box_is_said() -> None:
-    look = GlobalCheck(32, 20, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
-    clauses = optimal_line(1e-9, look=look).clauses
+    global_check = GlobalCheck(32, 20, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
+    clauses = optimal_line(1e-9, global_check=global_check).clauses
     assert any("-290" in words for words in clauses)
     assert "checked at 20 other theta of the box and 12 of the run" in clauses
-    assert "none better at 20 other" in optimal_line(1e-9, look=replace(look, x=None)).words
+    none = optimal_line(1e-9, global_check=replace(global_check, x=None))
+    assert "none better at 20 other" in none.words
 
 
 @given(st.floats(1e-2, 1e4), st.floats(1e-3, 0.5))

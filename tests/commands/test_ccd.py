@@ -61,20 +61,21 @@ def options_read(module: ModuleType) -> set[str]:
 @pytest.mark.parametrize("word", COMMANDS)
 def test_an_option_in_the_help_is_read(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module = import_module(COMMANDS[word][0])
-    asked: list[argparse.ArgumentParser] = []
+    required: list[argparse.ArgumentParser] = []
 
     def note(command: object, arguments: Any, *_: object, **__: object) -> int:
-        asked.append(arguments)
+        required.append(arguments)
         return 0
 
     monkeypatch.setattr("ccd_casadi.support.command_line.run", note)
     module.main([])
-    told = {action.dest for action in asked[0]._actions if action.help != argparse.SUPPRESS} - {
+    shown = (action for action in required[0]._actions if action.help != argparse.SUPPRESS)
+    reported = {action.dest for action in shown} - {
         "help",
         "workers",
         "no_user_code",
     }
-    assert told - options_read(module) == set()
+    assert reported - options_read(module) == set()
 
 
 def test_a_new_stage_is_a_case_that_can_be_solved(

@@ -76,9 +76,9 @@ def test_what_examples_and_studies_import_is_there() -> None:
 
 
 def test_an_extra_that_an_error_names_has_the_package() -> None:
-    asked = {pair for path in SOURCES for pair in required(path)}
-    assert ("bokeh", "explore") in asked
-    assert [(name, extra) for name, extra in asked if distribution(name) not in EXTRAS[extra]] == []
+    pairs = {pair for path in SOURCES for pair in required(path)}
+    assert ("bokeh", "explore") in pairs
+    assert [(name, extra) for name, extra in pairs if distribution(name) not in EXTRAS[extra]] == []
 
 
 def test_every_file_beside_the_sources_ships() -> None:

@@ -36,8 +36,8 @@ def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
     """Lines break between words, paths are whole, and no bar stays on a line of the answer."""
     case = str(ccd_casadi.TWO_MASS)
     lines = on_screen(columns, "check", case)
-    told = [line for line in lines if case not in line and "compiling" not in line]
-    assert max(map(len, told)) <= columns
+    reported = [line for line in lines if case not in line and "compiling" not in line]
+    assert max(map(len, reported)) <= columns
     assert any(case in line for line in lines)
     assert any(line.startswith("plant         two_mass: 1 input") for line in lines)
     ends = [line for line in lines if line.startswith("checking the plant")]

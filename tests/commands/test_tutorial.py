@@ -81,9 +81,9 @@ def test_every_command_gives_what_the_page_shows(
         if wanted not in command or module.removeprefix("ccd_casadi.") in but.split():
             continue
         code = import_module(module).main([*words, "--workers", "1"])
-        told = capsys.readouterr()
-        assert code == 0, f"{command}: {told.err}"
-        printed = iter(told.out.splitlines())
+        reported = capsys.readouterr()
+        assert code == 0, f"{command}: {reported.err}"
+        printed = iter(reported.out.splitlines())
         for line in shown:
             assert any(same(line, other) for other in printed), f"{command}: no line {line!r}"
         ran += 1

@@ -194,9 +194,9 @@ def test_a_rate_that_does_not_do_names_the_one_that_does(
     assert main([str(two_mass_run), *out, "--rate-hz", "6000", *QUICK]) == 4
     words = capsys.readouterr().err
     assert "It was NOT verified" in (tmp_path / "controller.h").read_text()
-    told = re.match(r"not verified: 6000 Hz with foh with lead is not enough: .*; (\d+)", words)
-    assert told is not None
-    assert 7000.0 < float(told[1]) < 9000.0
+    reported = re.match(r"not verified: 6000 Hz with foh with lead is not enough: .*; (\d+)", words)
+    assert reported is not None
+    assert 7000.0 < float(reported[1]) < 9000.0
     assert json.loads((tmp_path / "deploy.json").read_text())["status"] == "not_verified"
     assert main([str(two_mass_run), *out, "--delay", "0.005", *QUICK]) == 2
     assert "shorten it" in capsys.readouterr().err

@@ -127,9 +127,9 @@ def test_a_run_that_is_not_verified_is_refused_unless_asked(
     assert "failed: robust" in err
     assert not (run / "deploy").exists()
     assert main([str(run), *QUICK, "--unverified"]) == 4
-    told = json.loads((run / "deploy" / "deploy.json").read_text())
-    assert told["status"] == "not_verified"
-    assert "failed: robust" in told["reason"]
+    reported = json.loads((run / "deploy" / "deploy.json").read_text())
+    assert reported["status"] == "not_verified"
+    assert "failed: robust" in reported["reason"]
     assert "verified" not in (run / "deploy" / "controller.h").read_text().replace(
         "not verified", ""
     ).replace("NOT verified", "").replace("not been verified", "")
@@ -168,11 +168,11 @@ def test_robustness_judges_the_deployed_controller_on_the_same_plants(
     words = ["--controller", str(tmp_path / "deploy" / "controller.json"), "--shift", "2"]
     words += ["--samples", "2", "--quiet", "--out", str(out)]
     assert robustness([str(robust_run), *words]) == 0
-    told = json.loads((out / "robustness.json").read_text())
-    plants = told["resonance_shift"]["plants"]
+    reported = json.loads((out / "robustness.json").read_text())
+    plants = reported["resonance_shift"]["plants"]
     expected = peaks(run, found, [p["shift"] for p in plants])
     assert [p["sensitivity_peak"] for p in plants] == pytest.approx(expected, rel=1e-6)
-    rms = [v for key, v in told["noise"].items() if key.startswith("rms_")]
+    rms = [v for key, v in reported["noise"].items() if key.startswith("rms_")]
     assert len(rms) == 4
     assert all(np.isfinite(v).all() and np.min(v) > 0.0 for v in rms)
-    assert told["period"] == pytest.approx(1.0 / found.rate_hz)
+    assert reported["period"] == pytest.approx(1.0 / found.rate_hz)

@@ -140,9 +140,9 @@ class VerifiedRule(Verified):
         return ""
 
     def searched(
-        self, outcome: FormulationResult, look: GlobalCheck | None
+        self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[str, Mapping[str, Any]]:
-        return search_evidence(1, 1, look)
+        return search_evidence(1, 1, global_check)
 
 
 # 4. The outer problem.

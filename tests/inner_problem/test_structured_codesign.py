@@ -93,15 +93,15 @@ def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path:
     """In any order, by one worker or two, from the store or computed."""
     thetas = np.array([[58.0, 58.0], [66.0, 69.0]])
 
-    def asked(order: list[int], workers: int, name: str) -> list[tuple]:
+    def required(order: list[int], workers: int, name: str) -> list[tuple]:
         with Workers(workers) as pool, SampleStore(tmp_path / name) as store:
             found = Sampler(anchored, store, pool).values(thetas[order])
         return [(s.theta, s.bandwidth, s.gradient, s.kappa) for s in found]
 
-    first = asked([0, 1], 1, "a.sqlite")
+    first = required([0, 1], 1, "a.sqlite")
     assert all(np.isfinite(item[1]) for item in first)
-    assert asked([1, 0], 2, "b.sqlite") == first[::-1]
-    assert asked([0, 1], 1, "a.sqlite") == first
+    assert required([1, 0], 2, "b.sqlite") == first[::-1]
+    assert required([0, 1], 1, "a.sqlite") == first
 
 
 @pytest.mark.slow
@@ -236,8 +236,8 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
-            asked = replace(case, inner=replace(case.inner, S_max=bound))
-            of = Sampler(asked, store, Workers(1))
+            required = replace(case, inner=replace(case.inner, S_max=bound))
+            of = Sampler(required, store, Workers(1))
             found, words = stored_searches.with_initial_search(of, 0)
             assert (structured_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",

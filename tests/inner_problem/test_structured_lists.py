@@ -41,7 +41,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
 ) -> None:
     races = []
     for module in (stored_searches, structured_search):
-        honest = module.race
+        honest = module.search_starts
 
         def counted(*arguments: object, honest: object = honest, **more: object) -> object:
             races.append(arguments)

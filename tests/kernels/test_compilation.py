@@ -83,32 +83,32 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_first_to_come_compiles_with_words_and_the_second_does_not(
     empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[-1]) or True)
+    required: list[int] = []
+    monkeypatch.setattr(compilation, "_compile", lambda *given: required.append(given[-1]) or True)
     compilation.ensure_compiled()
     said = capsys.readouterr().err
     assert "compiling" in said
     assert " s on " in said
     assert said.count("\n") == 1
     compilation.ensure_compiled()
-    assert len(asked) == 1
+    assert len(required) == 1
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(compilation, "_state", lambda: "another version of numba")
     compilation.ensure_compiled()
-    assert len(asked) == 2
+    assert len(required) == 2
 
 
 def test_a_job_compiles_the_group_that_it_needs_and_the_other_when_that_is_needed(
     empty: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[str, ...]] = []
-    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[2]) or True)
+    required: list[tuple[str, ...]] = []
+    monkeypatch.setattr(compilation, "_compile", lambda *given: required.append(given[2]) or True)
     compilation.ensure_compiled("synthesis")
     assert compilation.is_compiled("synthesis")
     assert not compilation.is_compiled("loops")
     compilation.ensure_compiled()
     compilation.ensure_compiled("loops")
-    assert asked == [*compilation.GROUPS.values()]
+    assert required == [*compilation.GROUPS.values()]
 
 
 def test_the_parts_of_a_group_call_every_kernel_of_its_modules() -> None:
@@ -138,44 +138,44 @@ def test_what_was_not_finished_is_not_taken_for_finished(
     else:
         compilation.ensure_compiled()
     assert ("no memory" in capsys.readouterr().err) == (how == "no process")
-    asked: list[int] = []
-    monkeypatch.setattr(compilation, "_compile", lambda *told: asked.append(told[-1]) or True)
+    required: list[int] = []
+    monkeypatch.setattr(compilation, "_compile", lambda *given: required.append(given[-1]) or True)
     compilation.ensure_compiled()
-    assert len(asked) == 1
+    assert len(required) == 1
 
 
 def test_two_programs_do_not_compile_the_same(
     empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    begun, go, asked = threading.Event(), threading.Event(), []
+    started, go, required = threading.Event(), threading.Event(), []
 
-    def slowly(*told: object) -> bool:
-        asked.append(told[-1])
-        begun.set()
+    def slowly(*reported: object) -> bool:
+        required.append(reported[-1])
+        started.set()
         return go.wait(30.0)
 
     monkeypatch.setattr(compilation, "_compile", slowly)
     first = threading.Thread(target=compilation.ensure_compiled)
     second = threading.Thread(target=compilation.ensure_compiled)
     first.start()
-    assert begun.wait(30.0)
+    assert started.wait(30.0)
     second.start()
     while "waiting" not in capsys.readouterr().err:
         assert second.is_alive()
     go.set()
     first.join(30.0)
     second.join(30.0)
-    assert len(asked) == 1
+    assert len(required) == 1
 
 
 def test_a_source_that_changes_meanwhile_is_compiled_again(
     empty: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The stamp named the sources as they were at the end: what was compiled were others."""
-    state, asked = ["before"], []
+    state, required = ["before"], []
 
-    def edited(*told: int) -> bool:
-        asked.append(told[-1])
+    def edited(*reported: int) -> bool:
+        required.append(reported[-1])
         state[0] = "after"
         return True
 
@@ -183,7 +183,7 @@ def test_a_source_that_changes_meanwhile_is_compiled_again(
     monkeypatch.setattr(compilation, "_compile", edited)
     for _ in range(3):
         compilation.ensure_compiled()
-    assert len(asked) == 2
+    assert len(required) == 2
 
 
 COUNTED = """

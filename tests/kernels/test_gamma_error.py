@@ -31,13 +31,13 @@ def test_the_bound_is_the_same_in_any_coordinates(seed: int, log_S: float, log_T
     plant = flexible_case(seed).plant if seed % 5 else two_mass(55.0 + 0.05 * seed, 60.0)
     w = weights(plant, log_S, log_T)
     Q = np.linalg.qr(np.random.default_rng(seed).normal(size=plant.A.shape))[0]
-    found, told = [], 1e-11
+    found, reported = [], 1e-11
     for A, B, C in ((plant.A, plant.B, plant.C), (Q.T @ plant.A @ Q, Q.T @ plant.B, plant.C @ Q)):
         bound, at = gamma_lower_bound(prepare(A, B, C), w, plant.grid, plant.gain)
         found.append(bound)
-        told += bound_error(A, B, C, w, at)
-    assert told < 1e-6
-    assert found[1] == pytest.approx(found[0], rel=told)
+        reported += bound_error(A, B, C, w, at)
+    assert reported < 1e-6
+    assert found[1] == pytest.approx(found[0], rel=reported)
 
 
 def test_a_design_that_the_bound_limits_has_the_error_of_the_bound() -> None:
@@ -48,17 +48,17 @@ def test_a_design_that_the_bound_limits_has_the_error_of_the_bound() -> None:
         data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain)
         _, at = gamma_lower_bound(prepare(*data[:3]), w, plant.grid, plant.gain)
         error = bound_error(*data[:4], at)
-        told = []
+        reported = []
         for balanced in (False, True):
             row = synthesise(*data, 1.02, 0.0, balanced)[0]
             if row[Column.LIMITED_BY_BOUND]:
                 assert row[Column.GAMMA_OPT] == row[Column.GAMMA_LOWER_BOUND]
                 assert 0.0 < error <= gamma_error(row, *data)
-                told.append(gamma_error(row, *data))
+                reported.append(gamma_error(row, *data))
         # far from γ_X: nothing but the error of the bound, and the search's 1e-11; a processor may
         # round in one of the coordinates so that γ_X is not known to be far
-        assert not told or min(told) <= error + 2e-11
-        limited += len(told)
+        assert not reported or min(reported) <= error + 2e-11
+        limited += len(reported)
     assert limited >= 4
 
 
@@ -86,6 +86,6 @@ def test_where_the_limit_passes_from_the_riccati_level_to_the_bound_both_sides_a
         found = row(middle)
         i = limited.index(bool(found[Column.LIMITED_BY_BOUND]))
         ends[i], sides[i] = middle, found
-    told = sum(gamma_error(side, *data(x)) for side, x in zip(sides, ends, strict=True)) + 1e-10
-    assert told < 1e-3
-    assert sides[1][Column.GAMMA_OPT] == pytest.approx(sides[0][Column.GAMMA_OPT], rel=told)
+    reported = sum(gamma_error(side, *data(x)) for side, x in zip(sides, ends, strict=True)) + 1e-10
+    assert reported < 1e-3
+    assert sides[1][Column.GAMMA_OPT] == pytest.approx(sides[0][Column.GAMMA_OPT], rel=reported)

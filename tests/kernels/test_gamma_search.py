@@ -157,8 +157,8 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
         step = riccati.root_nearby(B1, C1, d1, frame, f / (slope * t * t))[0]
         return np.sqrt(t / (1.0 + step * t) + d1**2), gamma.rounding_error(frame, t, d1)
 
-    told, rng = root(H0)[1], np.random.default_rng(seed)
-    size = 1e-7 * gamma.BACKWARD / told  # γ_opt is to move by 1e-7 of itself
+    reported, rng = root(H0)[1], np.random.default_rng(seed)
+    size = 1e-7 * gamma.BACKWARD / reported  # γ_opt is to move by 1e-7 of itself
     moved = []
     for _ in range(60):
         change = rng.standard_normal(H0.shape)
@@ -166,7 +166,7 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
         moved.append(root(H0 + change)[0] / level - 1.0)
     # by the median: of 300 changes one lost the subspace, whichever rounding chooses
     spread = 1.4826 * np.median(np.abs(moved))
-    assert spread == pytest.approx(told * size / gamma.BACKWARD, rel=0.4)
+    assert spread == pytest.approx(reported * size / gamma.BACKWARD, rel=0.4)
 
 
 @pytest.mark.parametrize("seed", [81, 45])
@@ -186,7 +186,7 @@ def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: 
     assert row[design.Column.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
     for guess in (0.98, 1.01, 1.03):  # other levels on the way, other rounding
         again = kernel(*data, guess * own[0], False)[0]
-        told = row[design.Column.GAMMA_ERROR] + again[design.Column.GAMMA_ERROR]
+        reported = row[design.Column.GAMMA_ERROR] + again[design.Column.GAMMA_ERROR]
         assert again[design.Column.GAMMA_OPT] == pytest.approx(
-            row[design.Column.GAMMA_OPT], rel=told
+            row[design.Column.GAMMA_OPT], rel=reported
         )

@@ -134,13 +134,13 @@ def written(seed: int, folder: Path) -> tuple[Path, list[str]]:
     return path, has
 
 
-def fault(code: int, told: str) -> str:
+def fault(code: int, reported: str) -> str:
     """What is wrong with how a run ended; empty where nothing is."""
-    if "Traceback" in told or code not in (0, 2, 3, 4):
-        return f"traceback or exit code {code}: {told[-1500:]}"
-    if infinite := re.search(r"J (?:-?inf|nan)\b.*", told):
+    if "Traceback" in reported or code not in (0, 2, 3, 4):
+        return f"traceback or exit code {code}: {reported[-1500:]}"
+    if infinite := re.search(r"J (?:-?inf|nan)\b.*", reported):
         return infinite[0]
-    best = [float(J) for J in re.findall(r"best so far: J (\S+),", told)]
+    best = [float(J) for J in re.findall(r"best so far: J (\S+),", reported)]
     if any(after > before for before, after in itertools.pairwise(best)):
         return f"best so far goes backwards: {best}"
     return ""
@@ -159,8 +159,8 @@ def ended(seed: int, minutes: float, patience: float) -> dict[str, Any]:
             row |= {"code": done.returncode, "fault": fault(done.returncode, done.stderr)}
             row["words"] = done.stdout.strip()[:200]
         except subprocess.TimeoutExpired as error:
-            told = (error.stderr or b"").decode(errors="replace")
-            row |= {"code": None, "fault": f"no end in {limit:.0f} s: {told[-1500:]}"}
+            reported = (error.stderr or b"").decode(errors="replace")
+            row |= {"code": None, "fault": f"no end in {limit:.0f} s: {reported[-1500:]}"}
         result = path.with_suffix("") / "result.json"
         if result.exists():
             kept = json.loads(result.read_text())

@@ -28,8 +28,8 @@ def _full(folder: Path, amount: float) -> Iterator[None]:
 @contextmanager
 def _clock(folder: Path, amount: float) -> Iterator[None]:
     """Every look at the clock shows an earlier time."""
-    now, looks = time.time(), iter(range(10**9))
-    with patch.object(time, "time", lambda: now - amount * next(looks)):
+    now, global_checks = time.time(), iter(range(10**9))
+    with patch.object(time, "time", lambda: now - amount * next(global_checks)):
         yield
 
 

@@ -71,7 +71,7 @@ def answer(kind: str, seed: int, pipe: "mp.connection.Connection") -> None:
         pipe.send((type(error).__name__, np.nan, np.nan, False, time.perf_counter() - began))
 
 
-def asked(kind: str, seed: int, seconds: float) -> tuple[str, float, float, bool, float]:
+def required(kind: str, seed: int, seconds: float) -> tuple[str, float, float, bool, float]:
     here, there = mp.Pipe()
     process = mp.get_context("fork").Process(target=answer, args=(kind, seed, there))
     process.start()
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # of python-control, about what it calls itself
-    rows = [(asked("ours", seed, options.seconds), asked("slicot", seed, options.seconds))
+    rows = [(required("ours", seed, options.seconds), required("slicot", seed, options.seconds))
             for seed in range(options.cases)]  # fmt: skip
     for name, i in (("ours", 0), ("SB10AD", 1)):
         words = [row[i][0] for row in rows if row[i][0]]

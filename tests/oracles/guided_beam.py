@@ -64,7 +64,7 @@ def their_pid(w: float, mass: float) -> StateSpace:
     return StateSpace(*tf2ss(above, np.polymul([1.0, 3.0 * w, 0.0], [1.0, 5.0 * w])))
 
 
-def look(count: int) -> None:
+def global_check(count: int) -> None:
     """ω_b* on a grid over the box of both heights."""
     problem = prepared(problem_of(load_case(CASE)))[0]
     axes = [np.linspace(low, high, count) for low, high in zip(*box(problem), strict=True)]
@@ -127,6 +127,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     mm = [1e-3 * height for height in given.heights]
     if given.grid:
-        look(given.grid)
+        global_check(given.grid)
     else:
         main(list(zip(mm[::2], mm[1::2], strict=True)) or list(BEAMS))

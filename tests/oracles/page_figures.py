@@ -74,7 +74,7 @@ def tuned_disagreements(folder: Path, terminal: str) -> list[str]:
         return [] if plain(r["reason"]) in text else ["terminal: another reason"]
     page = page_of(folder)
     rows = {raw(row[0]): raw(row[1]) for block in _blocks(page, c.Facts) for row in block.rows}
-    told = [
+    reported = [
         (text, rf"bandwidth ({NUMBER}) Hz, \|S\|", r["bandwidth_hz"]),
         (text, rf"\|S\| at most ({NUMBER}) at", r["sensitivity_peak"]),
         (text, rf"margins phase ({NUMBER}) deg", r["phase_margin_deg"]),
@@ -83,9 +83,9 @@ def tuned_disagreements(folder: Path, terminal: str) -> list[str]:
         (raw(page.head.lead), rf"a bandwidth of ({NUMBER}) Hz", r["bandwidth_hz"]),
     ]
     if r["models"]:
-        told.append((raw(page.head.lead), rf"‖S‖∞ = ({NUMBER})", max(r["models"])))
+        reported.append((raw(page.head.lead), rf"‖S‖∞ = ({NUMBER})", max(r["models"])))
     claims = []
-    for where, pattern, value in told:
+    for where, pattern, value in reported:
         found = re.search(pattern, where)
         claims.append((found is not None and same(found[1], value), f"tune: {pattern}"))
     decision = plain(page.head.decision)
@@ -122,7 +122,7 @@ def _words(r: Mapping[str, Any], terminal: str, page: c.Page) -> Claims:
 
 
 def _terminal(r: Mapping[str, Any], text: str) -> Claims:
-    told: list[tuple[str, str, float | None, float]] = [
+    reported: list[tuple[str, str, float | None, float]] = [
         ("objective", rf"objective ({NUMBER}) ", r["objective"], 1.0),
         ("bandwidth", rf"bandwidth ({NUMBER}) Hz", r["bandwidth_hz"], 1.0),
         ("peak", rf"sensitivity peak ({NUMBER}) at", r["sensitivity_peak"], 1.0),
@@ -135,8 +135,8 @@ def _terminal(r: Mapping[str, Any], text: str) -> Claims:
         ("cost", rf"cost ({NUMBER}) syntheses", r["syntheses"], 1.0),
     ]
     if r["settling_ms"] is not None:
-        told.append(("settling", rf"within 2 % after ({NUMBER}) ms", r["settling_ms"], 1.0))
-    for name, pattern, value, scale in told:
+        reported.append(("settling", rf"within 2 % after ({NUMBER}) ms", r["settling_ms"], 1.0))
+    for name, pattern, value, scale in reported:
         found = re.search(pattern, text)
         yield found is not None and same(found[1], value, scale), f"terminal: {name}"
     yield _length(r"force step " + LENGTH, text, r["force_step_max"]), "terminal: force step"

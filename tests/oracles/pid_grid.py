@@ -202,19 +202,19 @@ def compared(case: Case, seed: int) -> dict[str, Any]:
     plant = build_plant(case.function, tuple(case.theta), case.options)
     system = mechanics(plant, np.array(list(case.theta.values())))
     suspension = Suspension(case.suspended_hz)
-    begun = time.process_time()
+    started = time.process_time()
     plants = [scale_plant(modal_plant(system, suspension, Perturbation(shift, 1.0)), case.M_K)
               for shift in case.shifts]  # fmt: skip
     made = synthesise_sections(plants, PID, case.bounds, seed=seed)
-    spent = time.process_time() - begun
+    spent = time.process_time() - started
     loop = loop_of(system, suspension, case.shifts, case.bounds,
                    case.expected_hz * HZ, made.frequencies[0])  # fmt: skip
-    begun = time.process_time()
+    started = time.process_time()
     _, kappa, looked = refined(loop)
     grid, over = judged(loop, kappa)
     row: dict[str, Any] = {
         "grid_hz": grid / HZ, "grid_over_bound": over, "grid_kappa": np.exp(kappa).tolist(),
-        "controllers": looked, "grid_seconds": time.process_time() - begun,
+        "controllers": looked, "grid_seconds": time.process_time() - started,
         "outcome": made.outcome.value, "search_seconds": spent,
     }  # fmt: skip
     if made.certified:

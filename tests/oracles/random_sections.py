@@ -129,20 +129,20 @@ def case(seed: int) -> Case:
 
 def solved(seed: int) -> dict[str, Any]:
     """The synthesis of a seed and its judge, as a row."""
-    asked, begun = case(seed), time.process_time()
+    required, started = case(seed), time.process_time()
     row: dict[str, Any] = {"seed": seed, "kind": "climb" if seed % WHOLE else "whole"}
-    on_set = [point for _, point in asked.uncertain.corners()]
+    on_set = [point for _, point in required.uncertain.corners()]
     design: SectionsDesign | None
     if seed % WHOLE:
-        asked, design = climbed(asked, seed)
+        required, design = climbed(required, seed)
         certified = design is not None and design.certified
         allowed = 2.0 * JudgeOptions.tolerance
-        proof = proved(asked, design) if certified and design is not None else None
+        proof = proved(required, design) if certified and design is not None else None
         random_too = False  # the certificate is of the set; what is proven is of the box
     else:
         made = synthesise_robustly(
-            asked.uncertain, asked.structure, asked.bounds, sampling=asked.sampling, starts=1,
-            seed=seed, rounds=1, count=COUNT,
+            required.uncertain, required.structure, required.bounds, sampling=required.sampling,
+            starts=1, seed=seed, rounds=1, count=COUNT,
         )  # fmt: skip
         design, certified, allowed, proof = made.design, made.certified, ALLOWED, made.proof
         random_too = True
@@ -150,18 +150,18 @@ def solved(seed: int) -> dict[str, Any]:
         row["words"] = design.words
     row |= {
         "outcome": "NO_STABLE_START" if design is None else design.outcome.name,
-        "certified": certified, "seconds": round(time.process_time() - begun, 3),
+        "certified": certified, "seconds": round(time.process_time() - started, 3),
     }  # fmt: skip
     if proof is not None:
         row |= {"proof": proof.outcome.name, "boxes": proof.boxes}
     if design is None or design.controller is None or proof is None:
         return row
     rng = np.random.default_rng(seed + 10**9)
-    ends = asked.uncertain.box
+    ends = required.uncertain.box
     random = [rng.uniform(ends[0], ends[1]) for _ in range(RANDOM_PLANTS if len(ends[0]) else 0)]
     wrong: list[str] = []
     for i, point in enumerate([*on_set, *random]):
-        found = figures(asked, point, design)
+        found = figures(required, point, design)
         worst = max(found, key=lambda name: found[name])
         if certified and (i < len(on_set) or random_too):
             row["worst"] = max(row.get("worst", -1.0), found[worst] - 1.0)
@@ -176,7 +176,7 @@ def solved(seed: int) -> dict[str, Any]:
             if "STABLE" in found:
                 wrong.append(f"proven, unstable at {point}")
     if proof.refuted:
-        passed = figures(asked, np.array(proof.point), design)
+        passed = figures(required, np.array(proof.point), design)
         if not max(passed.values()) > 1.0 + 0.999 * proof.slack:
             wrong.append(f"said to be refuted at {proof.point}, is {passed}")
     if proof.outcome.name == "UNSTABLE":
@@ -184,14 +184,14 @@ def solved(seed: int) -> dict[str, Any]:
     return row | ({"wrong": wrong} if wrong else {})
 
 
-def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
+def climbed(required: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     """A short climb on the corners from a random controller, by whose figures the bounds are."""
     rng = np.random.default_rng(seed + 2 * 10**9)
-    plants = asked.uncertain.plants(asked.uncertain.corners())
-    free = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    plants = required.uncertain.plants(required.uncertain.corners())
+    free = problem_for(plants, required.structure, required.bounds, required.sampling)
     starts = stabilising(free, at_random(free, np.exp(rng.uniform(np.log(0.03), 0.0, 24)), rng))
     if not len(starts):
-        return asked, None
+        return required, None
     peaks = assess(free, starts[0], LoopProblem.first_tau, depth=-50.0).peaks
     assert peaks is not None
     over = {code: float(np.exp(peaks.value[peaks.curve == code].max(initial=-np.inf)))
@@ -202,11 +202,11 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     drawn = {}
     for name, ratio in has.items():
         times = float(np.exp(rng.uniform(0.02, 0.6)))
-        if getattr(asked.bounds, name) is not None:
-            drawn[name] = getattr(asked.bounds, name) * ratio * times
+        if getattr(required.bounds, name) is not None:
+            drawn[name] = getattr(required.bounds, name) * ratio * times
     drawn["S_max"] = max(drawn["S_max"], 1.2)
-    asked = replace(asked, bounds=replace(asked.bounds, **drawn))
-    problem = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    required = replace(required, bounds=replace(required.bounds, **drawn))
+    problem = problem_for(plants, required.structure, required.bounds, required.sampling)
     first = at_its_bandwidth(problem, starts[0], within=DesignOptions.margin)
     end = ascend(problem, first, iterations=CLIMB)
     point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
@@ -215,26 +215,26 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
         end = ascend(problem, point, iterations=RESTORED, restoring=True, radius=0.05)
         point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
         looked += end.evaluations
-    search = DesignSearch(problem, plants, asked.sampling, seed=seed)
-    return asked, search.designed(point, (), 1, looked)
+    search = DesignSearch(problem, plants, required.sampling, seed=seed)
+    return required, search.designed(point, (), 1, looked)
 
 
-def proved(asked: Case, design: SectionsDesign) -> Proof:
+def proved(required: Case, design: SectionsDesign) -> Proof:
     """What a few boxes prove."""
-    return prove(asked.uncertain, asked.structure, design.kappa, design.bandwidth, asked.bounds,
-                 asked.sampling, most_boxes=BOXES)  # fmt: skip
+    return prove(required.uncertain, required.structure, design.kappa, design.bandwidth,
+                 required.bounds, required.sampling, most_boxes=BOXES)  # fmt: skip
 
 
-def impossible(asked: Case, near: float) -> bool:
+def impossible(required: Case, near: float) -> bool:
     """Whether no controller of any order keeps the bounds on the corners, at any ω_b down to a
     thousandth of ω_low; `near` (rad/s): where they are tight."""
-    uncertain = asked.uncertain
-    each = [limits_of(uncertain.plant(point).plant_si(), asked.bounds, asked.sampling,
-                      integrator=asked.structure.integrator)
+    uncertain = required.uncertain
+    each = [limits_of(uncertain.plant(point).plant_si(), required.bounds, required.sampling,
+                      integrator=required.structure.integrator)
             for _, point in uncertain.corners()]  # fmt: skip
     sets = [replace(own, others=tuple(other for other in each if other is not own))
             for own in each]  # fmt: skip
-    return any(forbids(limits, 1e-3 * asked.bounds.omega_low, near) for limits in sets)
+    return any(forbids(limits, 1e-3 * required.bounds.omega_low, near) for limits in sets)
 
 
 def counted(rows: Iterable[dict[str, Any]]) -> dict[str, Any]:

@@ -143,9 +143,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=30)
     parser.add_argument("--first", type=int, default=0)
-    asked = parser.parse_args()
+    required = parser.parse_args()
     found = []
-    for seed in range(asked.first, asked.first + asked.cases):
+    for seed in range(required.first, required.first + required.cases):
         found.append(run(seed))
         print(found[-1], flush=True)
     kept = [one for one in found if "S_over_S_max" in one]

@@ -132,10 +132,10 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--starts", type=int, default=2)
-    asked = parser.parse_args()
+    required = parser.parse_args()
     found = []
-    for seed in range(asked.first, asked.first + asked.cases):
-        found.append(run(seed, asked.starts))
+    for seed in range(required.first, required.first + required.cases):
+        found.append(run(seed, required.starts))
         print(found[-1], flush=True)
     usable = [one for one in found if one["usable"]]
     print(f"{len(usable)} of {len(found)} usable; largest |S| over S_max "

@@ -30,19 +30,19 @@ class Case:
     sampling: Sampling | None
 
 
-def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str, float]:
+def figures(required: Case, point: np.ndarray, design: SectionsDesign) -> dict[str, float]:
     """Every figure over its bound on one plant of the box; infinite where the loop is unstable."""
     controller = design.controller
     assert controller is not None
     a, k_b, k_c = controller.A, controller.B[:, 0], controller.C[0]
     k_d = float(controller.D[0, 0])
-    A, b, c = chain_at(asked, point)
+    A, b, c = chain_at(required, point)
     n = len(A) // 2
     rest = np.setdiff1d(np.arange(len(A)), [0, n])  # the first mode is the free body, b c/s²
     body = float(c[0] * b[n])
     poles, V = np.linalg.eig(A[np.ix_(rest, rest)])
     left, right = np.linalg.solve(V, b[rest] + 0j), c[rest] @ V
-    T = None if asked.sampling is None else asked.sampling.period
+    T = None if required.sampling is None else required.sampling.period
     if T is None:
         closed = np.block([[A - np.outer(b, c) * k_d, np.outer(b, k_c)], [-np.outer(k_b, c), a]])
         loop_poles = np.linalg.eigvals(closed)
@@ -51,9 +51,9 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
         fastest = max(np.abs(poles).max(initial=0.0), np.abs(loop_poles).max())
         top, roots = 1e3 * fastest, loop_poles
     else:
-        assert asked.sampling is not None
-        age = int(np.ceil(1e-6 * asked.sampling.delay_us / T - 1e-9))
-        h = T * age - 1e-6 * asked.sampling.delay_us  # of the newest force in a period
+        assert required.sampling is not None
+        age = int(np.ceil(1e-6 * required.sampling.delay_us / T - 1e-9))
+        h = T * age - 1e-6 * required.sampling.delay_us  # of the newest force in a period
         late = np.expm1(poles * h) / poles * left if h > 1e-12 else np.zeros_like(left)
         early = np.exp(poles * h) * np.expm1(poles * (T - h)) / poles * left
         n, m = len(A), len(a)
@@ -84,11 +84,11 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
             return {"STABLE": np.inf}
         top, roots = np.pi / T, np.log(inside[np.abs(inside) > 1e-12]) / T
     near = np.concatenate([roots, poles, np.linalg.eigvals(a)])
-    omega = [np.geomspace(1e-2 * asked.bounds.omega_low, top, 3000)]
+    omega = [np.geomspace(1e-2 * required.bounds.omega_low, top, 3000)]
     steps = np.concatenate([-np.geomspace(1e-2, 30.0, 25), [0.0], np.geomspace(1e-2, 30.0, 25)])
     omega += [abs(p.imag) + abs(p.real) * steps for p in near]
-    bandwidth, bounds = design.bandwidth, asked.bounds
-    rest = [] if asked.structure.integrator else [1e-5 * bounds.omega_low]
+    bandwidth, bounds = design.bandwidth, required.bounds
+    rest = [] if required.structure.integrator else [1e-5 * bounds.omega_low]
     w = np.unique(np.concatenate([*omega, [bandwidth, bounds.omega_low], rest]))
     w = w[(w > 0.0) & (w <= top)]
     s = 1j * w
@@ -102,7 +102,7 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
         coasted = (first + T * (h * z + T - h) / (z - 1.0)) / (z - 1.0)
         G = np.exp(-s * T * age) * (terms.sum(1) + body * coasted)
         x = 2.0 / T * (z - 1.0) / (z + 1.0)
-    k = product(asked.structure, design.kappa, x)
+    k = product(required.structure, design.kappa, x)
     few = np.array([0, len(w) // 2, int(np.argmin(np.abs(w - bandwidth)))])
     solved_too = np.linalg.solve(x[few, None, None] * np.eye(len(a)) - a, k_b[:, None] + 0j)[..., 0]
     if not np.allclose((k_c * solved_too).sum(1) + k_d, k[few], rtol=1e-4, atol=0.0):
@@ -110,7 +110,7 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     S = 1.0 / (1.0 + G * k)
     low = int(np.argmin(np.abs(w - bounds.omega_low)))
     found = {"S_MAX": np.abs(S).max() / bounds.S_max, "S_LOW": abs(S[low]) / bounds.S_low}
-    counted = w if asked.structure.integrator else np.maximum(w, bounds.omega_low)
+    counted = w if required.structure.integrator else np.maximum(w, bounds.omega_low)
     below = w <= bandwidth
     size = np.abs(S) * np.sqrt(2.0)
     found["LEVEL"] = size[below].max()
@@ -158,13 +158,13 @@ def driven(A: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
     return np.asarray(expm(np.block([[A, b[:, None]], [np.zeros((1, n + 1))]]) * t)[:n, n])
 
 
-def chain_at(asked: Case, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def chain_at(required: Case, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A, b, c) of the chain at a point of the box, in modal coordinates."""
-    values = dict(zip(asked.uncertain.names, point.tolist(), strict=True))
-    root = 1.0 / np.sqrt(asked.mass)
-    lam, modes = np.linalg.eigh(root[:, None] * asked.stiffness * root)
+    values = dict(zip(required.uncertain.names, point.tolist(), strict=True))
+    root = 1.0 / np.sqrt(required.mass)
+    lam, modes = np.linalg.eigh(root[:, None] * required.stiffness * root)
     omega = np.sqrt(np.maximum(lam, 0.0)) * (1.0 + values.get("resonance_shift", 0.0))
-    zeta = np.full(len(lam), asked.zeta * values.get("damping", 1.0))
+    zeta = np.full(len(lam), required.zeta * values.get("damping", 1.0))
     omega[0], n = 0.0, len(lam)  # the free chain
     rate = np.where(omega > 0.0, omega, 1.0)
     A = np.zeros((2 * n, 2 * n))
@@ -172,4 +172,4 @@ def chain_at(asked: Case, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     A[n:, :n], A[n:, n:] = -np.diag(omega), -np.diag(2.0 * zeta * omega)
     shape = root[:, None] * modes
     b = np.concatenate([np.zeros(n), shape[0]]) * (1.0 + values.get("gain", 0.0))
-    return A, b, np.concatenate([shape[asked.sensor] / rate, np.zeros(n)])
+    return A, b, np.concatenate([shape[required.sensor] / rate, np.zeros(n)])

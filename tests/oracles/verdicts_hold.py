@@ -261,10 +261,10 @@ def measured(folder: Path, chain: Chain, case: dict[str, Any], seconds: float) -
             chain.at(1.0, 1.0), json.loads((folder / "controller.json").read_text()), loop
         )
         peak, most = float(closed.gain(HZ * hz).max()), case["inner"]["S_max"]
-        told = abs(peak / answer["sensitivity_peak"] - 1.0)
+        reported = abs(peak / answer["sensitivity_peak"] - 1.0)
         row["wrong"] = [] if closed.stable else ["unstable"]
         row["wrong"] += [f"peak of S {peak:.8g}"] if peak > most * (1.0 + 1e-6) else []
-        row["wrong"] += [f"peak of S is {peak:.8g}"] if told > 1e-6 else []
+        row["wrong"] += [f"peak of S is {peak:.8g}"] if reported > 1e-6 else []
     return row
 
 

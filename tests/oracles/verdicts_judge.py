@@ -212,8 +212,8 @@ def _claims(
     if not robust:
         peak, most = model.peak(), model.bandwidth(-slack)
         yield abs(peak / r["sensitivity_peak"] - 1.0) <= CLOSE, f"peak of S is {peak:.8g}"
-        told = sections or most <= slowest * (1.0 + CLOSE)  # a shape may bind below -3 dB
-        yield told, f"bandwidth is more than told: {most / HZ:.8g} Hz"
+        reported = sections or most <= slowest * (1.0 + CLOSE)  # a shape may bind below -3 dB
+        yield reported, f"bandwidth is more than told: {most / HZ:.8g} Hz"
     low = max(float(each.gain(HZ * inner["omega_low_hz"])[0]) for each in everywhere)
     yield low <= inner["S_low"] * (1.0 + slack), f"|S| at omega_low {low:.6g}"
     if "compliance_max" in inner and not loop:
@@ -238,10 +238,10 @@ def _ranges(
         ("S_max_shift", (-0.5, 0.5), lambda x, share: keeps(of(x, 1.0), share)),
         ("stable_damping", (-0.9, 9.0), lambda x, share: of(0.0, 1.0 + x).stable),
     ):
-        for told, furthest in zip(line.get(what, ()), most, strict=False):
-            end = told - (what == "stable_damping")
+        for reported, furthest in zip(line.get(what, ()), most, strict=False):
+            end = reported - (what == "stable_damping")
             inside = [x for x in np.linspace(0.0, (1.0 - NEAR) * end, 25) if not holds(x, 1.0)]
-            yield not inside, f"{what} to {told:.5g}, not so at {inside[:1]}"
+            yield not inside, f"{what} to {reported:.5g}, not so at {inside[:1]}"
             beyond = (1.0 + NEAR) * end + 1e-5 * np.sign(furthest)
             followed = abs(end) >= abs(furthest) * (1.0 - 1e-9)
-            yield followed or not holds(beyond, 0.4), f"{what} to {told:.5g}, further in truth"
+            yield followed or not holds(beyond, 0.4), f"{what} to {reported:.5g}, further in truth"

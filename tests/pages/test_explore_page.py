@@ -330,11 +330,11 @@ def test_a_page_from_elsewhere_gets_no_socket(tmp_path):
             return error.code == 403
         return False
 
-    async def asked():
+    async def chosen():
         explorer._server.start()
         return [await refused(origin) for origin in (own, *elsewhere)]
 
-    found = explorer._server.io_loop.run_sync(asked)
+    found = explorer._server.io_loop.run_sync(chosen)
     explorer.close()
     assert found == [False, True, True, True]
 

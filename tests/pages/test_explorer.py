@@ -61,14 +61,14 @@ def asked_of_inner(capsys, theta, *options):
     return code, json.loads(capsys.readouterr().out)
 
 
-def same(look, found):
+def same(design, found):
     """Every figure of a look equals that of `inner`."""
-    f = look.figures
+    f = design.figures
     pairs = [
-        (look.bandwidth_hz, "bandwidth_hz"), (f.sensitivity_peak, "sensitivity_peak"),
+        (design.bandwidth_hz, "bandwidth_hz"), (f.sensitivity_peak, "sensitivity_peak"),
         (f.sensitivity_low, "sensitivity_low"), (f.gamma, "gamma"), (f.gamma_opt, "gamma_opt"),
         (f.omega_S / HZ, "omega_S_hz"), (f.omega_T / HZ, "omega_T_hz"),
-        (look.cost, "hardware_cost"), (look.objective, "objective"),
+        (design.cost, "hardware_cost"), (design.objective, "objective"),
     ]  # fmt: skip
     return all(value == pytest.approx(found[name], rel=EQUAL) for value, name in pairs)
 
@@ -105,21 +105,21 @@ def test_designs_at_random_are_those_of_inner(session, capsys):
         hz = [float(np.exp(rng.uniform(*np.log(pair)))) for pair in box]
         options = ("--omega-s-hz", repr(hz[0]), "--omega-t-hz", repr(hz[1]))
         code, found = asked_of_inner(capsys, theta, *options)
-        look = present(problem, knobs, elements_at(problem, theta), (HZ * hz[0], HZ * hz[1]))
-        assert (look.standing is Standing.REFUSED) == (code != 0)
+        design = present(problem, knobs, elements_at(problem, theta), (HZ * hz[0], HZ * hz[1]))
+        assert (design.standing is Standing.REFUSED) == (code != 0)
         if code == 0:
-            assert same(look, found)
-            assert (look.standing is Standing.KEPT) == found["feasible"]
+            assert same(design, found)
+            assert (design.standing is Standing.KEPT) == found["feasible"]
 
 
 def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
-    look, c = searched_look, curves_of(searched_look)
-    assert look.how is How.SEARCHED
-    assert look.standing is Standing.KEPT
-    assert c.view.gains[0].max() == pytest.approx(look.figures.sensitivity_peak, rel=1e-6)
+    design, c = searched_look, curves_of(searched_look)
+    assert design.how is How.SEARCHED
+    assert design.standing is Standing.KEPT
+    assert c.view.gains[0].max() == pytest.approx(design.figures.sensitivity_peak, rel=1e-6)
     # what the certificate says of each of them
     assert (c.view.gains <= c.view.bounds * (1.0 + 1e-9)).all()
-    assert c.view.gains[0][c.view.hz == look.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
+    assert c.view.gains[0][c.view.hz == design.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
     assert c.poles[2].real.max() < 0.0
     # the distance of L from -1 is 1/|S|
     near = np.abs(1.0 + c.view.open[0, :, 0, 0])
@@ -135,21 +135,21 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
 
 def test_a_bound_that_is_missed_is_said_so(session, searched_look):
     stricter = replace(session.start, S_max=1.5)
-    look = session.live(stricter)  # at the weights that suit a larger S_max
-    assert look.standing is Standing.MISSED
-    assert "S_max = 1.5" in look.reason
-    assert curves_of(look) is not None
+    design = session.live(stricter)  # at the weights that suit a larger S_max
+    assert design.standing is Standing.MISSED
+    assert "S_max = 1.5" in design.reason
+    assert curves_of(design) is not None
 
 
 def test_what_is_not_certified_says_why_and_has_no_bandwidth(searched_look):
     failed = replace(searched_look.figures, outcome=Outcome.UNSTABLE_LOOP)
     standing, reason = judged(searched_look.problem, failed)
-    look = replace(searched_look, figures=failed, standing=standing, reason=reason)
+    design = replace(searched_look, figures=failed, standing=standing, reason=reason)
     assert standing is Standing.REFUSED
     assert reason == Outcome.UNSTABLE_LOOP.value
-    assert np.isnan(look.bandwidth_hz)
-    assert sampled_of(look) is None
-    assert curves_of(replace(look, controller=None)) is None
+    assert np.isnan(design.bandwidth_hz)
+    assert sampled_of(design) is None
+    assert curves_of(replace(design, controller=None)) is None
 
 
 def test_hold_and_delay_take_their_share_of_the_margin(searched_look):
@@ -172,9 +172,9 @@ def test_the_standing_is_that_of_the_worst_that_was_judged(searched_look):
         loose = replace(searched_look.problem.inner, S_max=1.01 * searched_look.problem.inner.S_max)
         problem = replace(searched_look.problem, inner=loose)
         for before in (Standing.KEPT, Standing.MISSED, Standing.NEAR, Standing.REFUSED):
-            look = replace(searched_look, knobs=knobs, standing=before, problem=problem)
-            found = as_sampled(look.plant, look.controller, rate, delay)
-            after = with_sampled(look, found)
+            design = replace(searched_look, knobs=knobs, standing=before, problem=problem)
+            found = as_sampled(design.plant, design.controller, rate, delay)
+            after = with_sampled(design, found)
             assert after.standing == max(before, worst, key=order.index)
     assert "unstable as sampled at 3162 Hz" in after.reason
     assert np.isnan(after.bandwidth_hz)
@@ -185,19 +185,19 @@ def test_another_plant_than_the_models_own_certifies_nothing(session, searched_l
     for error, kept in ((0.0, True), (0.01, True), (0.05, False), (np.inf, False)):
         near = replace(own, error=error, words="a plant nearby")
         point = searched_look.figures.omega_S, searched_look.figures.omega_T
-        look = present(searched_look.problem, searched_look.knobs, near, point)
-        assert (look.standing is Standing.KEPT) == kept
-        assert (look.standing is Standing.NEAR) != kept
-        assert np.isfinite(look.objective) == kept  # no J of one θ's mass and another's bandwidth
-        words = standing_html(look, curves_of(look), None)
+        design = present(searched_look.problem, searched_look.knobs, near, point)
+        assert (design.standing is Standing.KEPT) == kept
+        assert (design.standing is Standing.NEAR) != kept
+        assert np.isfinite(design.objective) == kept  # no J of one θ's mass and another's bandwidth
+        words = standing_html(design, curves_of(design), None)
         assert ("certified, keeps its bounds" in words) == kept
         assert ("a plant nearby" in words) == (error > 0.0) or kept
 
 
 def test_the_margins_told_are_where_stability_ends(session, searched_look):
     assert "K by itself is stable" in standing_html(searched_look, curves_of(searched_look), None)
-    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
-    c, G, K = curves_of(look), look.plant.plant_si(), look.controller
+    design = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
+    c, G, K = curves_of(design), design.plant.plant_si(), design.controller
 
     def stable(factor):
         loop = closed_loop(G, replace(K, C=factor * K.C, D=factor * K.D))
@@ -209,15 +209,15 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
     ):
         assert stable(gain * inwards)
         assert not stable(gain / inwards)
-    assert "UNSTABLE (poles at 143.1 Hz)" in standing_html(look, c, None)
+    assert "UNSTABLE (poles at 143.1 Hz)" in standing_html(design, c, None)
     assert "feedforward" in move_words(c)
     alone = replace(c, move=replace(c.move, feedforward=False))
     assert "without feedforward" in move_words(alone)
 
 
 def test_margins_are_drawn_where_the_loop_has_them(session):
-    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # with a margin downwards too
-    view = curves_of(look).view
+    design = session.full(replace(session.start, theta=(55.0, 55.0)))  # with a margin downwards too
+    view = curves_of(design).view
     size, phase = loop_panels(view)
 
     def L(hz):
@@ -235,7 +235,7 @@ def test_margins_are_drawn_where_the_loop_has_them(session):
     assert min(turned, 360.0 - turned) < 1.0  # read off the grid's straight pieces
     gap = phase.curves[-1].y
     assert abs(gap[0] - gap[1]) == pytest.approx(view.margins.phase_deg, abs=1.0)
-    drawn_too = drawn(look, curves_of(look), None).panels
+    drawn_too = drawn(design, curves_of(design), None).panels
     assert drawn_too["L"].marks == size.marks  # what a page shows is what the explorer shows
 
 
@@ -335,8 +335,8 @@ def test_masses_and_springs_are_read_from_the_matrices(session, searched_look):
     assert (1, -1, pytest.approx(1e6)) in grounded.springs
     other = family((1.0, 1.0))  # in modal coordinates there are no masses to draw
     assert lumped(other) is None
-    look = replace(searched_look, elements=replace(searched_look.elements, system=other))
-    assert "<table>" in machine_html(look, session.start.theta, 1.0)
+    design = replace(searched_look, elements=replace(searched_look.elements, system=other))
+    assert "<table>" in machine_html(design, session.start.theta, 1.0)
 
 
 def family(theta):

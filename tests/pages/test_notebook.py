@@ -80,19 +80,21 @@ def test_a_case_and_its_problem_show_the_same() -> None:
 
 
 def test_inner_designs_show_their_figures() -> None:
-    asked = problem()
-    best = ccd.true_inner(asked, (60.0, 60.0))
+    chosen = problem()
+    best = ccd.true_inner(chosen, (60.0, 60.0))
     assert all(words in shown(best) for words in ("58.12", "S_max, omega_T lower binds"))
     assert best.optimum is not None
     assert "58.12" in shown(best.optimum)
     none = ccd.true_inner(
-        replace(asked, inner=replace(asked.inner, S_max=1.01, sweep_points=(3, 3)), method="sweep"),
+        replace(
+            chosen, inner=replace(chosen.inner, S_max=1.01, sweep_points=(3, 3)), method="sweep"
+        ),
         (60.0, 60.0),
     )
     assert "where S_max = 1.01 is required" in shown(none)
     made = ccd.synthesise(
-        ccd.scaled_plant(asked, (60.0, 60.0)),
-        asked.weights.at(800.0 * HZ, 40.0 * HZ), omega_low=HZ,
+        ccd.scaled_plant(chosen, (60.0, 60.0)),
+        chosen.weights.at(800.0 * HZ, 40.0 * HZ), omega_low=HZ,
     )  # fmt: skip
     assert "55.558 Hz" in shown(made)
 

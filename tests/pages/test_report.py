@@ -250,8 +250,8 @@ def test_what_binds_is_said_in_words(run: Any) -> None:
     for words in ("m1 is at its lower bound, 55 kg. Lowering this bound by 0.15 kg",
                   r"Raising S_max by 1 %"):  # fmt: skip
         moves = rf"ω_b changes by {number_} Hz, the cost by {number_} kg"
-        told = rf"{words}: {moves} \(J falls by {number_}\)"
-        said = re.search(told, text)
+        heard = rf"{words}: {moves} \(J falls by {number_}\)"
+        said = re.search(heard, text)
         assert said is not None
         hz, kg, J = map(float, said.groups())
         assert J > 0.0  # one true pair: J = w1 f + w2 ω_b has it

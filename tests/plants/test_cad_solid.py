@@ -124,6 +124,6 @@ def test_an_edge_that_runs_the_other_way_is_turned() -> None:
 
 def test_a_face_of_another_kind_is_refused() -> None:
     one, other = (bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}) for _ in range(2))
-    bent = Piece("Cylinder", other.faces[4].rim, other.faces[4].points)
+    bending = Piece("Cylinder", other.faces[4].rim, other.faces[4].points)
     with pytest.raises(PlantError, match=r"the face \(Plane\) at .* has no counterpart"):
-        matched(one, Boundary(other.corners, other.edges, {4: bent}))
+        matched(one, Boundary(other.corners, other.edges, {4: bending}))

@@ -107,12 +107,12 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     assert min(one, other) > 0.1
     # what the optimum answers to: S_max moves the kink, and J with it
     answers = structured_responses(anchored, best, found)
-    told = {item.parameter: item.objective for item in answers.responses}["S_max"]
+    reported = {item.parameter: item.objective for item in answers.responses}["S_max"]
     ends = []
     for sign in (1.0, -1.0):
         inner = replace(anchored.inner, S_max=anchored.inner.S_max + sign * 1e-3)
         ends.append(kink(replace(anchored, inner=inner), 0.06).bandwidth)
-    assert told == pytest.approx(-(ends[0] - ends[1]) / 2e-3, rel=1e-3)
+    assert reported == pytest.approx(-(ends[0] - ends[1]) / 2e-3, rel=1e-3)
 
 
 def test_elsewhere_on_the_kink_the_beam_is_not_optimal(anchored: CoDesignProblem) -> None:

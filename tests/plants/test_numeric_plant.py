@@ -70,26 +70,26 @@ def test_differences_are_the_exact_derivatives_up_to_the_bounds(a: float, b: flo
 
 
 def test_the_function_is_never_asked_outside_the_bounds() -> None:
-    asked = []
+    required = []
 
     def watched(theta):
-        asked.append((float(theta["m"]), float(theta["t"])))
+        required.append((float(theta["m"]), float(theta["t"])))
         return numbers_only(theta)
 
     plant = user_plant(watched, NAMES, {}, LOWER, UPPER)
-    asked.clear()
+    required.clear()
     for theta in (LOWER, UPPER):
         plant.evaluate(theta)
-    assert len(asked) >= 8
-    assert (np.array(asked) >= np.array(LOWER) * (1 - 1e-12)).all()
-    assert (np.array(asked) <= np.array(UPPER) * (1 + 1e-12)).all()
+    assert len(required) >= 8
+    assert (np.array(required) >= np.array(LOWER) * (1 - 1e-12)).all()
+    assert (np.array(required) <= np.array(UPPER) * (1 + 1e-12)).all()
 
 
 def test_the_error_told_is_above_the_true_one_and_shows_noise() -> None:
     theta = (1.7, 3e-3)
     plant = user_plant(numbers_only, NAMES, {}, LOWER, UPPER)
-    told = float(plant.notes(theta)[0].split("at most ")[1].split()[0])
-    assert 1e-12 < told < 1e-4
+    reported = float(plant.notes(theta)[0].split("at most ")[1].split()[0])
+    assert 1e-12 < reported < 1e-4
     rng = np.random.default_rng(0)
 
     def noisy(theta):

@@ -48,10 +48,11 @@ def strengths(system: Mechanics) -> Array:
 def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, within: float) -> None:
     known = [HERE, HERE + STEP]
     for theta in known:
-        told, true = (reduced_at(stage, known, theta), stage.mechanics(theta, derivatives=False))
-        np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=within)
+        reported = reduced_at(stage, known, theta)
+        true = stage.mechanics(theta, derivatives=False)
+        np.testing.assert_allclose(frequencies(reported), frequencies(true), rtol=within)
         size = np.abs(strengths(true)).max()
-        np.testing.assert_allclose(strengths(told), strengths(true), atol=10.0 * within * size)
+        np.testing.assert_allclose(strengths(reported), strengths(true), atol=10.0 * within * size)
 
 
 @pytest.mark.parametrize(
@@ -61,11 +62,11 @@ def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, with
 )
 def test_at_a_known_theta_displacements_move_as_those_of_the_elements(stage: RibStage) -> None:
     """A search on a basis ends elsewhere where its slopes are not the elements'."""
-    told, true = reduced_at(stage, [HERE], HERE), stage.mechanics(tuple(HERE))
-    signs = np.sign(np.einsum("im,im->i", told.B, true.B))
+    reported, true = reduced_at(stage, [HERE], HERE), stage.mechanics(tuple(HERE))
+    signs = np.sign(np.einsum("im,im->i", reported.B, true.B))
     seen = np.abs(true.B).max(1) > 1e-6 * np.abs(true.B).max()  # what corners neither drive nor see
     moved = np.tensordot(STEP, true.derivatives[3], 1)[seen]
-    found = (signs[:, None] * np.tensordot(STEP, told.derivatives[3], 1))[seen]
+    found = (signs[:, None] * np.tensordot(STEP, reported.derivatives[3], 1))[seen]
     np.testing.assert_allclose(found, moved, atol=5e-3 * np.abs(moved).max())
 
 
@@ -75,8 +76,8 @@ def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
 
     def missed(share: float) -> float:
         theta = HERE + share * STEP
-        told, true = (reduced_at(BARE, known, theta), BARE.mechanics(theta))
-        return float(np.abs(frequencies(told) / frequencies(true) - 1.0).max())
+        reported, true = (reduced_at(BARE, known, theta), BARE.mechanics(theta))
+        return float(np.abs(frequencies(reported) / frequencies(true) - 1.0).max())
 
     assert missed(1.0) < 1e-2
     assert missed(0.5) < 0.3 * missed(1.0)
@@ -90,13 +91,13 @@ def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
 def test_its_derivatives_are_those_of_the_small_problem(stage: RibStage) -> None:
     known = [HERE, HERE + STEP, HERE - STEP]
     here, e = HERE + 0.3 * STEP, 1e-4
-    told = reduced_at(stage, known, here)
+    reported = reduced_at(stage, known, here)
     up, down = (reduced_at(stage, known, here + s * e * STEP) for s in (1.0, -1.0))
-    slope = np.einsum("t,tii->i", STEP, told.derivatives[2])
+    slope = np.einsum("t,tii->i", STEP, reported.derivatives[2])
     moved = (np.diag(up.K) - np.diag(down.K)) / (2.0 * e)
     np.testing.assert_allclose(slope, moved, atol=1e-3 * np.abs(moved).max())
-    dB, dC = (np.tensordot(STEP, told.derivatives[k], 1) for k in (3, 4))
-    slope = dC.T[:, :, None] * told.B[:, None, :] + told.C.T[:, :, None] * dB[:, None, :]
+    dB, dC = (np.tensordot(STEP, reported.derivatives[k], 1) for k in (3, 4))
+    slope = dC.T[:, :, None] * reported.B[:, None, :] + reported.C.T[:, :, None] * dB[:, None, :]
     moved = (strengths(up) - strengths(down)) / (2.0 * e)
     # What masses bend of higher modes turns with θ; its slope is that of modes that stay.
     within = 1e-4 if stage is BARE else 0.1
@@ -143,10 +144,10 @@ def test_a_plant_evaluates_it_in_its_own_order_of_parameters() -> None:
     names = ("H", "h", "t_o", "t_i", "t_c", "x_i")
     plant, place = plant_of_stage(BARE, names), [4, 0, 1, 2, 3, 5]
     there = HERE[place] + 0.1 * STEP[place]
-    told, true = nearby_model(plant, [HERE[place]], HERE[place])(there), plant.evaluate(there)
-    np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=1e-3)
+    reported, true = nearby_model(plant, [HERE[place]], HERE[place])(there), plant.evaluate(there)
+    np.testing.assert_allclose(frequencies(reported), frequencies(true), rtol=1e-3)
     np.testing.assert_allclose(
-        told.derivatives[2], true.derivatives[2], atol=0.1 * np.abs(true.derivatives[2]).max()
+        reported.derivatives[2], true.derivatives[2], atol=0.1 * np.abs(true.derivatives[2]).max()
     )
 
 

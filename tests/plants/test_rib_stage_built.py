@@ -73,8 +73,8 @@ def test_a_known_controller_is_where_inner_begins(
     assert len(kappa) == len(structure_of(problem).names)
     with pytest.raises(UserError, match="name a run of this case"):
         sections_kappa(built.DESIGN, Structure())
-    asked = ["--theta", "m1=60,m2=60", "--begin-at", str(built.DESIGN), "--quiet"]
-    assert inner_main([str(RUNS / "two_mass.toml"), *asked]) == 2
+    required = ["--theta", "m1=60,m2=60", "--begin-at", str(built.DESIGN), "--quiet"]
+    assert inner_main([str(RUNS / "two_mass.toml"), *required]) == 2
     assert "--begin-at" in capsys.readouterr().err
     with pytest.raises(UserError):
         sections_kappa(tmp_path, structure_of(problem))

@@ -112,13 +112,13 @@ def test_a_damaged_store_is_refused_or_reads_plain_samples(tmp_path: Path) -> No
             damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         path = tmp_path / f"{attempt}.sqlite"
         path.write_bytes(damaged)
-        told = ""
+        reported = ""
         try:
             use(path)
         except SampleStoreError as error:
-            told = str(error)
-        assert len(told.splitlines()) <= 1
-        refused += bool(told)
+            reported = str(error)
+        assert len(reported.splitlines()) <= 1
+        refused += bool(reported)
     assert refused > 10
 
 

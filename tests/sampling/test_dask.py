@@ -105,7 +105,7 @@ def test_tls_by_the_settings_of_dask(tmp_path: Path) -> None:
         processes.kill()
 
 
-def told(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def reported(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """The one line on stderr of a command that ends with 2 and leaves nothing behind."""
     code = main([str(TWO_MASS), "--out", str(tmp_path / "o"), "--scheduler", address])
     output, errors = capsys.readouterr()
@@ -118,7 +118,7 @@ def told(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> st
 def test_what_is_no_address_is_told(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = told(address, tmp_path, capsys)
+    words = reported(address, tmp_path, capsys)
     assert words.startswith(f"--scheduler {address}: is not an address; give what `dask")
 
 
@@ -134,5 +134,5 @@ def test_without_dask_the_remedy_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    words = told("tcp://127.0.0.1:8786", tmp_path, capsys)
+    words = reported("tcp://127.0.0.1:8786", tmp_path, capsys)
     assert "Dask, which is not installed; run: python -m pip install dask distributed" in words

@@ -153,12 +153,12 @@ def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
         if len(seen) == 2:
             break
     assert 0 < seen[0] < seen[1], "the second run went on from the first"
-    told = []
+    reported = []
     for name, workers in (("a", "2"), ("b", "1")):
         words = [sys.executable, str(script), str(tmp_path / f"{name}.sqlite"), workers]
         done = subprocess.run(words, capture_output=True, text=True, check=True)
-        told.append(done.stdout)
-    assert told[0] == told[1], "as many syntheses are counted as if nothing had happened"
+        reported.append(done.stdout)
+    assert reported[0] == reported[1], "as many syntheses are counted as if nothing had happened"
     assert table(tmp_path / "a.sqlite") == table(tmp_path / "b.sqlite")
 
 

@@ -23,7 +23,7 @@ GOOD, POOR = (1.0,), (2.0,)
 SLOPE = 40.0
 
 
-def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
+def branches(cliff: float, required: list[tuple]) -> Callable[[tuple], tuple]:
     """A unit of work whose climbs lose the better controller at a cliff, but from its own κ."""
 
     def unit(
@@ -43,7 +43,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
         }  # fmt: skip
         if case.controller.figure.key == "move_time":  # less is better, and the slope is of that
             payload |= {"error": 1.0 / value, "gradient": [-slope / 15.0 / value**2, 0.0]}
-        asked.append((theta, kappa))
+        required.append((theta, kappa))
         return key, ([], payload)
 
     return unit
@@ -57,14 +57,14 @@ def two_branches(**changes: object) -> CoDesignProblem:
 @few(max_examples=10)
 @given(st.floats(0.1, 0.3))
 def test_a_cliff_is_passed_by_its_controller(cliff: float) -> None:
-    asked: list[tuple] = []
+    required: list[tuple] = []
     with pytest.MonkeyPatch.context() as patch, SampleStore(":memory:") as store:
-        patch.setattr(module, "inner_unit", branches(cliff, asked))
+        patch.setattr(module, "inner_unit", branches(cliff, required))
         sampler = Sampler(two_branches(), store, Workers(1))
         best = pieces_from(sampler, sampler.values(np.array([55.0, 60.0]))[0], 1e-9)
     assert best.theta[0] == pytest.approx(55.0 + 15.0 * SLOPE / 80.0, abs=0.02)
     assert best.kappa == GOOD
-    assert len(asked) < 60
+    assert len(required) < 60
 
 
 @pytest.mark.parametrize("changes", [{}, {"minimise": "move_time"}])
@@ -72,8 +72,8 @@ def test_what_falls_short_of_its_neighbours_is_climbed_from_them(
     changes: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those near the best end are of its branch, and a run from the store repeats itself."""
-    asked: list[tuple] = []
-    monkeypatch.setattr(module, "inner_unit", branches(0.3, asked))
+    required: list[tuple] = []
+    monkeypatch.setattr(module, "inner_unit", branches(0.3, required))
     thetas = np.array([[55.0 + 15.0 * z, 60.0 + z] for z in np.linspace(0.0, 1.0, 11)])
     runs = []
     for _ in range(2):
@@ -84,8 +84,8 @@ def test_what_falls_short_of_its_neighbours_is_climbed_from_them(
             runs.append((list(sampler.solved.values()), sampler.syntheses))
     at = {round((one.theta[0] - 55.0) / 15.0, 3): one.kappa for one in runs[0][0]}
     assert {kappa for z, kappa in at.items() if 0.35 < z < 0.65} == {GOOD}
-    assert (thetas[5][0], POOR) in [(theta[0], kappa) for theta, kappa in asked[: len(thetas)]]
-    assert len(asked) < 2 * len(thetas)
+    assert (thetas[5][0], POOR) in [(theta[0], kappa) for theta, kappa in required[: len(thetas)]]
+    assert len(required) < 2 * len(thetas)
     assert runs[1] == runs[0]
 
 

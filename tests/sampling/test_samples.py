@@ -272,7 +272,7 @@ def test_stores_created_at_the_same_moment_in_threads(tmp_path: Path) -> None:
 
 def test_a_kill_leaves_whole_units_only(tmp_path: Path) -> None:
     path, rng = tmp_path / "s.sqlite", random.Random(3)
-    told: set[int] = set()
+    reported: set[int] = set()
     for attempt in range(3):
         process = writer(path, str(attempt), 0.001)
         assert process.stdin is not None
@@ -280,15 +280,15 @@ def test_a_kill_leaves_whole_units_only(tmp_path: Path) -> None:
         assert process.stdout.readline() == "imported\n"
         process.stdin.write("\n")
         process.stdin.flush()
-        told.add(int(process.stdout.readline()))
+        reported.add(int(process.stdout.readline()))
         time.sleep(rng.uniform(0.0, 0.06))
         process.send_signal(signal.SIGKILL)
         rest, _ = process.communicate()
-        told.update(map(int, rest.split()))
+        reported.update(map(int, rest.split()))
         assert process.returncode == -signal.SIGKILL
         with SampleStore(path) as store:
             units = [row.theta[0] for row in store.select()]
-            assert all(store.get_result(str(unit)) for unit in told), "what was told is kept"
+            assert all(store.get_result(str(unit)) for unit in reported), "what was told is kept"
             found = [unit for unit in range(60) if store.get_result(str(unit))]
         assert {unit: units.count(unit) for unit in set(units)} == dict.fromkeys(found, 5)
-    assert len(told) >= 3
+    assert len(reported) >= 3

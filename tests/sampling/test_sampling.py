@@ -165,14 +165,14 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
 def test_theta_is_all_but_the_last_two_however_many_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made, asked = units.true_design(problem(), (60.0, 60.0), 400.0 * HZ, 60.0 * HZ), []
-    monkeypatch.setattr(units, "true_design", lambda _, *where: asked.append(where) or made)
+    made, required = units.true_design(problem(), (60.0, 60.0), 400.0 * HZ, 60.0 * HZ), []
+    monkeypatch.setattr(units, "true_design", lambda _, *where: required.append(where) or made)
     for theta in ((1.0,), (1.0, 2.0), (1.0, 2.0, 3.0, 4.0)):
         x = (*theta, np.log(400.0 * HZ), np.log(60.0 * HZ))
         (row,), _ = units.design_unit((problem(), [("d", x)]))
         assert row.theta == theta
-        assert asked[-1][0] == theta
-        assert asked[-1][1:] == pytest.approx((400.0 * HZ, 60.0 * HZ))
+        assert required[-1][0] == theta
+        assert required[-1][1:] == pytest.approx((400.0 * HZ, 60.0 * HZ))
 
 
 @pytest.mark.parametrize("violated", [False, True])

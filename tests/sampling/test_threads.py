@@ -83,14 +83,14 @@ def test_what_runs_alongside_holds_nobody_up() -> None:
     assert alongside(context.get)() == 7
     with pytest.raises(ZeroDivisionError):
         alongside(lambda: 1 / 0)()
-    begun, go_on = threading.Event(), threading.Event()
+    started, go_on = threading.Event(), threading.Event()
 
     def waiting() -> bool:
-        begun.set()
+        started.set()
         return go_on.wait(60.0)
 
     result = alongside(waiting)
-    assert begun.wait(60.0)
+    assert started.wait(60.0)
     assert all(one.daemon for one in threading.enumerate() if one.name == "alongside")
     go_on.set()
     assert result()

@@ -214,8 +214,8 @@ def test_what_the_whole_asks_anyway_changes_nothing(off: tuple[float, ...]) -> N
 @pytest.mark.parametrize("off", [(0.0,), (0.0, 0.2)])
 def test_a_dense_grid_sees_every_channels_bounds_held(off: tuple[float, ...]) -> None:
     """On uncoupled and on coupled plants; they cost bandwidth, so that they do something."""
-    asked = {"1": {"bandwidth_ratio": 1.5}, "2": {"S_max": 1.3}, "3": {"M_K": 0.05 * M_K}}
-    own = channel_bounds(structure().decoupling, asked)
+    required = {"1": {"bandwidth_ratio": 1.5}, "2": {"S_max": 1.3}, "3": {"M_K": 0.05 * M_K}}
+    own = channel_bounds(structure().decoupling, required)
     bounds = replace(BOUNDS, channels=own)
     made, plain = designed(off, bounds), designed(off, BOUNDS)
     assert made.certified, made.words
@@ -245,8 +245,8 @@ def test_the_judge_refuses_what_passes_a_channels_bound_alone() -> None:
     K = problem.structure.state_space(problem.structure.in_units(kappa, of.omega_0, of.force))
     wide = replace(BOUNDS, S_max=50.0, S_low=0.5, weighted_level=1e3, compliance_max=1.0)
 
-    def judged(asked):
-        return certify([of], K, replace(wide, channels=channel_bounds(channels, asked)))
+    def judged(required):
+        return certify([of], K, replace(wide, channels=channel_bounds(channels, required)))
 
     name = channels.names[1]
     peak = judged({name: {"S_max": 49.0}}).plants[0].channels[1].S_peak

@@ -281,35 +281,35 @@ def test_the_box_holds_the_plants_that_it_names() -> None:
 
 def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     box = uncertain(resonance_shift=0.02, gain=0.03)
-    asked = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
-    heads, looked = worst_plants(asked, count=40)
-    values = asked.excesses(lattice(box, 60, 7))
+    required = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
+    heads, looked = worst_plants(required, count=40)
+    values = required.excesses(lattice(box, 60, 7))
     assert looked > 40
     assert heads[0].value >= values.max() - 1e-6
     assert heads[0].value == pytest.approx(
-        asked.excesses([(heads[0].option, heads[0].point)])[0]
+        required.excesses([(heads[0].option, heads[0].point)])[0]
     )
 
 
 def test_plants_are_assessed_alike_by_any_number_of_workers(design) -> None:
     box = uncertain(resonance_shift=0.02, gain=0.03)
-    asked = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
+    required = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
     points = lattice(box, 60, 7)
     assert len(points) > WorstPlantOptions.batch
-    whole = asked.assessed(box.plants(points)).largest
+    whole = required.assessed(box.plants(points)).largest
     with Workers(2) as workers:
-        spread = asked.excesses(points, workers)
-    assert (spread == asked.excesses(points)).all()
+        spread = required.excesses(points, workers)
+    assert (spread == required.excesses(points)).all()
     np.testing.assert_allclose(spread, whole, atol=1e-6)  # measured: 2e-9
 
 
 def test_far_within_all_bounds_the_worst_plant_is_named_too(design) -> None:
     box = uncertain(mode_shift=1e-3, gain=1e-3)
-    asked = LoopOnBox(box, SMALL, design.kappa, 0.5 * design.bandwidth, EASY.looser(10.0))
+    required = LoopOnBox(box, SMALL, design.kappa, 0.5 * design.bandwidth, EASY.looser(10.0))
     points = lattice(box, 12, 0)
-    heads, _ = climbed(asked, points)
+    heads, _ = climbed(required, points)
     assert heads[0].value < 0.0
-    assert heads[0].value >= asked.excesses(points).max() - 1e-6
+    assert heads[0].value >= required.excesses(points).max() - 1e-6
 
 
 @pytest.mark.parametrize("S_low", [EASY.S_low, 1e-3 * EASY.S_low])
@@ -323,14 +323,14 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(S_low: float) -> None:
     kappa = stabilising(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]
     units = members.plants
     kappa = SMALL.in_units(kappa, units.omega_0, units.force)
-    asked = LoopOnBox(box, SMALL, kappa, 0.01 * units.omega_0, EASY)
-    masked = replace(asked, bounds=replace(EASY, S_low=S_low))
+    required = LoopOnBox(box, SMALL, kappa, 0.01 * units.omega_0, EASY)
+    masked = replace(required, bounds=replace(EASY, S_low=S_low))
     heads, looked = worst_plants(masked, count=12)
     ends = np.array(list(np.ndindex(*(2,) * 7)))
     corners = [(0, box.box[row, np.arange(7)]) for row in ends]
-    values = asked.excesses([*lattice(box, 12, 0), *corners])
+    values = required.excesses([*lattice(box, 12, 0), *corners])
     assert looked < len(corners)
-    found = asked.excesses([(head.option, head.point) for head in heads])
+    found = required.excesses([(head.option, head.point) for head in heads])
     assert found.max() >= values.max() - 1e-6
 
 

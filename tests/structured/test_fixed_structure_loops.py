@@ -72,11 +72,11 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
     kappa = rng.normal(0.0, 0.5, len(structure.names))
     s = 1j * np.geomspace(0.05, 20.0, 9)
     _, slopes, slope = response_and_slopes(structure, kappa, s)
-    h, bent = 1e-5, []
+    h, bending = 1e-5, []
     for i, step in enumerate(h * np.eye(len(kappa))):
         up, down = (response_and_slopes(structure, kappa + x, s) for x in (step, -step))
         np.testing.assert_allclose(np.log(up[0] / down[0]) / (2 * h), slopes[:, i], atol=1e-7)
-        bent.append((up[1] - down[1]) / (2 * h))
+        bending.append((up[1] - down[1]) / (2 * h))
     ends = [structure.response(kappa, s * np.exp(x)) for x in (h, -h)]
     np.testing.assert_allclose(np.log(ends[0] / ends[1]) / (2 * h), slope, atol=1e-7)
     k, alone, ln_slope = np.empty((3, 1), complex)
@@ -90,7 +90,7 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
         np.testing.assert_allclose([k, ln_slope], [[structure.response(kappa, at)], [slope[i]]])
         np.testing.assert_allclose(own, slopes[i], atol=1e-12)
         sections.second_slopes(loop.factors, own, bend)
-        np.testing.assert_allclose(bend, np.array(bent)[:, i], atol=1e-6)
+        np.testing.assert_allclose(bend, np.array(bending)[:, i], atol=1e-6)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, SLOW])

@@ -79,29 +79,29 @@ def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
     initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
     first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
                                 only_initial=True)  # fmt: skip
-    goal, begun = RmsError(tuple(plants), PID, BUDGET, FAST), []
+    goal, started = RmsError(tuple(plants), PID, BUDGET, FAST), []
 
     def descend(model: Any, start: Any, *others: Any) -> Any:
-        begun.append(start.x[:-1])
+        started.append(start.x[:-1])
         return local_search.descend(model, start, *others)
 
     monkeypatch.setattr(module, "descend", descend)
     known = least_value(plants, KEPT, first, goal, sampling=FAST).design.kappa
-    begun.clear()
+    started.clear()
     alone, both = (
         least_value(plants, KEPT, first, goal, sampling=FAST, initial=[known], only_initial=only)
         for only in (True, False)
     )
-    warm, *more = (PID.in_units(x, problem.plants.omega_0, problem.plants.force) for x in begun)
+    warm, *more = (PID.in_units(x, problem.plants.omega_0, problem.plants.force) for x in started)
     assert warm == pytest.approx(known)
     assert more[0] == pytest.approx(known)
     assert more[1:] == [pytest.approx(first.kappa)]
     assert both.value <= alone.value
     # What another search has gone through is not searched again, and the end is the same.
-    begun.clear()
+    started.clear()
     twice = least_value(plants, KEPT, first, goal, sampling=FAST, initial=[known, known],
                         only_initial=True)  # fmt: skip
-    assert len(begun) == 1
+    assert len(started) == 1
     assert (twice.value, twice.steps) == (alone.value, alone.steps)
 
 

@@ -160,11 +160,11 @@ def test_a_pole_too_fast_for_the_delay_is_told_before_a_search(tmp_path) -> None
         "[loop]\nrate_hz = 10000.0\ndelay_us = 100.0\n"
     )
     path = tmp_path / "case.toml"
-    for start, told in (("50.0", False), ("1000.0", True)):
+    for start, reported in (("50.0", False), ("1000.0", True)):
         path.write_text(case.replace("START", start))
         words = " ".join(found.words for found in diagnose(problem_of(load_case(path)))[1])
         assert "the stiffness drives a motion away at the start" in words
-        assert ("no controller has a peak of S below 2.51" in words) is told
+        assert ("no controller has a peak of S below 2.51" in words) is reported
 
 
 def test_a_levitated_plant_has_its_zone_of_iso_14839() -> None:

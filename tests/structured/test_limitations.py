@@ -66,9 +66,9 @@ def test_that_no_bandwidth_at_all_is_possible_is_shown_where_the_bounds_are_tigh
     """Of a problem that no search solved, and of none that has a certified design."""
     assert random_sections.impossible(random_sections.case(1053), 16.3 * HZ)
     for seed in (21,):
-        asked, design = random_sections.climbed(random_sections.case(seed), seed)
+        required, design = random_sections.climbed(random_sections.case(seed), seed)
         assert design.certified
-        assert not random_sections.impossible(asked, design.bandwidth)
+        assert not random_sections.impossible(required, design.bandwidth)
 
 
 def test_a_zero_in_the_right_half_plane_gives_poissons_bound() -> None:
@@ -161,9 +161,9 @@ def test_functions_bend_no_more_than_is_said(seed: int, decade: float, width: fl
     low = 10.0**decade
     v = np.linspace(low, low + width, 401)
     h = BASIS.values(v) @ weight
-    bent = np.abs(np.diff(h, 2)).max() / (v[1] - v[0]) ** 2
+    bending = np.abs(np.diff(h, 2)).max() / (v[1] - v[0]) ** 2
     said = BASIS.most_curved(v[:1], v[-1:], weight)[0]
-    assert bent <= said * (1.0 + 1e-6) + 1e-5 * np.abs(h).max()
+    assert bending <= said * (1.0 + 1e-6) + 1e-5 * np.abs(h).max()
 
 
 def test_functions_are_analytic_and_small_at_the_end() -> None:
@@ -280,15 +280,17 @@ def test_more_delay_never_gives_more() -> None:
 @pytest.mark.parametrize("seed", [7, 12, 28])
 def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
     """Random chains, of which a study had sixty."""
-    asked, made = random_sections.climbed(random_sections.case(seed), seed)
-    uncertain = asked.uncertain
+    required, made = random_sections.climbed(random_sections.case(seed), seed)
+    uncertain = required.uncertain
     assert made is not None
     limits = limits_of(
-        uncertain.plant(uncertain.nominal).plant_si(), asked.bounds, asked.sampling,
-        integrator=asked.structure.integrator,
+        uncertain.plant(uncertain.nominal).plant_si(), required.bounds, required.sampling,
+        integrator=required.structure.integrator,
     )  # fmt: skip
     assert made.bandwidth <= upper_bound(limits) < np.inf
-    pairs = opposite_corners(uncertain, asked.bounds, asked.sampling, asked.structure.integrator)
+    pairs = opposite_corners(
+        uncertain, required.bounds, required.sampling, required.structure.integrator
+    )
     shifted = pairs[:1] if "resonance_shift" in uncertain.names else []
     assert all(made.bandwidth <= upper_bound(pair) < np.inf for pair in shifted)
 

@@ -25,24 +25,24 @@ def test_what_is_certified_and_proven_holds_for_another_judge(seed: int) -> None
 
 def test_the_judge_refutes_what_does_not_hold() -> None:
     """A tighter bound, a bandwidth twice as high, and a state space that is not κ's."""
-    asked, design = random_sections.climbed(random_sections.case(21), 21)
-    nominal = asked.uncertain.nominal
-    assert max(random_sections.figures(asked, nominal, design).values()) <= 1.0 + 2e-5
-    tighter = replace(asked, bounds=replace(asked.bounds, S_max=1.0 + 1e-3))
+    required, design = random_sections.climbed(random_sections.case(21), 21)
+    nominal = required.uncertain.nominal
+    assert max(random_sections.figures(required, nominal, design).values()) <= 1.0 + 2e-5
+    tighter = replace(required, bounds=replace(required.bounds, S_max=1.0 + 1e-3))
     assert max(random_sections.figures(tighter, nominal, design).values()) > 1.0
     faster = replace(design, bandwidth=2.0 * design.bandwidth)
-    assert random_sections.figures(asked, nominal, faster)["SHAPE"] > 1.0
+    assert random_sections.figures(required, nominal, faster)["SHAPE"] > 1.0
     other = replace(design, kappa=design.kappa + 0.1)
-    assert "STATE_SPACE" in random_sections.figures(asked, nominal, other)
+    assert "STATE_SPACE" in random_sections.figures(required, nominal, other)
 
 
 def test_loops_of_real_poles_alone_are_looked_at() -> None:
     """NumPy gives their eigenvalues as real numbers, which the kernels did not take."""
-    asked, rng = random_sections.case(11), np.random.default_rng(0)
-    plants = asked.uncertain.plants(asked.uncertain.corners())
-    problem = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    required, rng = random_sections.case(11), np.random.default_rng(0)
+    plants = required.uncertain.plants(required.uncertain.corners())
+    problem = problem_for(plants, required.structure, required.bounds, required.sampling)
     drawn = stabilising(problem, at_random(problem, np.geomspace(0.01, 1.0, 200), rng))
-    poles = closed_loops(problem.plants, asked.structure, drawn)
+    poles = closed_loops(problem.plants, required.structure, drawn)
     real = drawn[(poles.imag == 0.0).all(axis=(1, 2))]
     assert len(real)
     for kappa in real:

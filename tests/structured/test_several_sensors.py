@@ -117,10 +117,10 @@ def test_values_and_slopes_of_every_place_are_those_of_its_fraction(
         np.testing.assert_allclose(to_kappa, by_difference, atol=1e-6)
         ahead, back = (of(kappa, v * np.exp(sign * step))[0] for sign in (1, -1))
         np.testing.assert_allclose(slope, (ahead - back) / (2.0 * step), atol=1e-6)
-        bent = np.array([(a[2] - b[2]) / (2.0 * step) for a, b in moved]).transpose(1, 2, 0)
+        bending = np.array([(a[2] - b[2]) / (2.0 * step) for a, b in moved]).transpose(1, 2, 0)
         loop = problem.loop(kappa, -1.0)
         found = second(at.curve, at.plant, np.zeros(4, int), v, loop)
-        np.testing.assert_allclose(found, bent, atol=1e-5)
+        np.testing.assert_allclose(found, bending, atol=1e-5)
 
 
 def test_a_design_keeps_S_max_at_every_place_by_the_formulas() -> None:
@@ -392,9 +392,9 @@ def test_a_reversed_sensor_is_named(
             assert f"outputs = {old}" in text
             text = text.replace(f"outputs = {old}", f"outputs = {list(new)}", 1)
     (tmp_path / "case.toml").write_text(text)
-    told = [w for w in suspicions(problem_of(load_case(tmp_path / "case.toml"))) if "sign" in w]
-    assert len(told) == len(named)
-    for words, name in zip(told, named, strict=True):
+    reported = [w for w in suspicions(problem_of(load_case(tmp_path / "case.toml"))) if "sign" in w]
+    assert len(reported) == len(named)
+    for words, name in zip(reported, named, strict=True):
         assert f"{name} to negative values" in words
 
 

@@ -78,10 +78,10 @@ def test_what_predicts_left_out_samples_badly_is_called_neither_smooth_nor_suppo
 def test_the_sentence_and_the_table_say_the_same_of_the_samples(q2: float) -> None:
     (q,) = surrogate_quality([process(0.0)], at(*[60.0, 60.0]))
     found = replace(q, loo=replace(q.loo, q2=q2))
-    look, said = table_trust([found]).rows[0][-2], recommendation([found])
-    assert ("predicted roughly" in said) == (look == "roughly followed")
-    assert ("predicted poorly" in said) == (look == "poorly followed")
-    assert ("support the design" in said) == (look == "followed")
+    global_check, said = table_trust([found]).rows[0][-2], recommendation([found])
+    assert ("predicted roughly" in said) == (global_check == "roughly followed")
+    assert ("predicted poorly" in said) == (global_check == "poorly followed")
+    assert ("support the design" in said) == (global_check == "followed")
 
 
 def test_a_design_beside_samples_that_are_missed_is_not_supported() -> None:

@@ -86,15 +86,15 @@ def test_the_inner_problem_keeps_it_and_knows_its_price() -> None:
     case = bounded(1.0)
     free = true_inner(case, THETA)
     assert free.optimum is not None
-    asked = bounded(0.97 * free.optimum.figures.compliance)
-    kept = true_inner(asked, THETA)
+    required = bounded(0.97 * free.optimum.figures.compliance)
+    kept = true_inner(required, THETA)
     assert kept.optimum is not None
     assert "compliance_max" in kept.active
-    assert asked.inner.feasible(kept.optimum.figures)
+    assert required.inner.feasible(kept.optimum.figures)
     assert kept.bandwidth < free.bandwidth
-    gradient = bandwidth_gradient(kept.optimum, kept.active, tuple(asked.inner.bounds))
+    gradient = bandwidth_gradient(kept.optimum, kept.active, tuple(required.inner.bounds))
     h = 0.5
-    ends = [true_inner(asked, (THETA[0], THETA[1] + s * h)).bandwidth for s in (1.0, -1.0)]
+    ends = [true_inner(required, (THETA[0], THETA[1] + s * h)).bandwidth for s in (1.0, -1.0)]
     assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(gradient[1], rel=2e-3)
 
 

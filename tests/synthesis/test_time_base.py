@@ -86,10 +86,10 @@ def test_a_system_of_python_control_is_named_too(discrete: dict[str, np.ndarray]
     parts = [discrete[name] for name in "ABCD"]
     with pytest.raises(UserError, match=r"dt is None.* appear discrete.*give dt"):
         from_control(control.ss(*parts, None))
-    told: list[str] = []
-    read_plant(control.ss(*parts), 0.0, told.append)
-    assert len(told) == 1
-    assert "appear discrete" in told[0]
-    read_plant(control.ss(*parts, 1e-3), 0.0, told.append)
-    read_plant(control.ss(plant([300.0], 0.02), *parts[1:]), 0.0, told.append)
-    assert len(told) == 1
+    reported: list[str] = []
+    read_plant(control.ss(*parts), 0.0, reported.append)
+    assert len(reported) == 1
+    assert "appear discrete" in reported[0]
+    read_plant(control.ss(*parts, 1e-3), 0.0, reported.append)
+    read_plant(control.ss(plant([300.0], 0.02), *parts[1:]), 0.0, reported.append)
+    assert len(reported) == 1

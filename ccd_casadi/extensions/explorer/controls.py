@@ -50,9 +50,9 @@ class PlacesFigure:
         # One source: of several the browser would tell one by one, as before the others' answer.
         self._points = Positions((*places.sensors, *places.actuators), known)
         a, b = len(places.sensors), len(places.actuators)
-        self._looks = {"colour": [GREEN] * a + [ORANGE] * b, "marker": ["circle"] * a + ["x"] * b,
+        self._styles = {"colour": [GREEN] * a + [ORANGE] * b, "marker": ["circle"] * a + ["x"] * b,
                        "size": [15] * a + [11] * b}  # fmt: skip
-        self._source = ColumnDataSource({name: [] for name in ("x", "y", *self._looks)})
+        self._source = ColumnDataSource({name: [] for name in ("x", "y", *self._styles)})
         self._source.on_change("data", self._heard)
         drawn = made.scatter("x", "y", source=self._source, size="size", marker="marker",
                              line_color="colour", line_width=3, fill_alpha=0.1)  # fmt: skip
@@ -64,7 +64,7 @@ class PlacesFigure:
     def marks(self, theta: Sequence[float]) -> Change:
         """What shows them at θ."""
         self._shown = np.append(theta, self._held)
-        return self._source, {"data": _columns(self._points.at(self._shown)) | self._looks}
+        return self._source, {"data": _columns(self._points.at(self._shown)) | self._styles}
 
     def _heard(self, attr: str, old: Any, new: Any) -> None:
         before, after = self._points.at(self._shown), np.transpose([new["x"], new["y"]]) / MM

@@ -15,7 +15,7 @@ from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
-from ccd_casadi.extensions.explorer.designs import Look, Standing
+from ccd_casadi.extensions.explorer.designs import ExploredDesign, Standing
 from ccd_casadi.extensions.explorer.notch import Notched
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
@@ -84,16 +84,16 @@ class AsSampled:
     gain: Array
 
 
-def curves_of(look: Look) -> Curves | None:
+def curves_of(design: ExploredDesign) -> Curves | None:
     """The curves of a design; None where its synthesis ended without a controller."""
-    if look.controller is None:
+    if design.controller is None:
         return None
-    plant, K, problem = look.plant, look.controller, look.problem
+    plant, K, problem = design.plant, design.controller, design.problem
     loop = loop_on(problem, plant.plant_si(), K)
-    bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
-    gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
-    bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)
-    f = look.figures
+    bandwidth = design.bandwidth_hz if np.isfinite(design.bandwidth_hz) else plant.omega_0 / HZ
+    gamma = float(np.nan_to_num(design.figures.certificate.norm_bound))
+    bounded = kind_of(problem).bounded(design.weights, gamma, design.bandwidth_hz)
+    f = design.figures
     top, at = f.sensitivity_peak, f.sensitivity_peak_frequency
     own = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
     peaks = ((at / HZ, top),) if abs(own / top - 1.0) < 1e-3 else None  # else another plant's
@@ -102,39 +102,39 @@ def curves_of(look: Look) -> Curves | None:
     if loop.stable:
         first = np.eye(loop.closed.B_r.shape[1])[0]
         time, y = step_response(loop, first, STEP_PERIODS / bandwidth, STEP_POINTS)
-        step, move = y[:, 0], _move(look, loop, bandwidth)
+        step, move = y[:, 0], _move(design, loop, bandwidth)
     return Curves(view, time, step, move)
 
 
-def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
+def _move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness."""
     ((made,),) = moves(
-        [loop], [mass_feedforward(look.modal, 0, loop.at)], setpoint(LIMITS), axis=0,
+        [loop], [mass_feedforward(design.modal, 0, loop.at)], setpoint(LIMITS), axis=0,
         window=LIMITS.window, bandwidth_hz=bandwidth_hz, options=MoveOptions(doublings=1),
     )  # fmt: skip
     return made.until(WATCHED * made.duration)
 
 
-def sampled_of(look: Look) -> AsSampled | None:
+def sampled_of(design: ExploredDesign) -> AsSampled | None:
     """A certified design at the rate and delay of its sliders; None where it is designed for it."""
-    refused = look.standing is Standing.REFUSED
-    if look.controller is None or refused or kind_of(look.problem).as_designed:
+    refused = design.standing is Standing.REFUSED
+    if design.controller is None or refused or kind_of(design.problem).as_designed:
         return None
-    return as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
+    return as_sampled(design.plant, design.controller, design.knobs.rate_hz, design.knobs.delay_us)
 
 
-def with_sampled(look: Look, found: AsSampled | None) -> Look:
+def with_sampled(design: ExploredDesign, found: AsSampled | None) -> ExploredDesign:
     """The look with the standing that its sampled loop leaves it."""
-    k, S_max = look.knobs, look.problem.inner.S_max
+    k, S_max = design.knobs, design.problem.inner.S_max
     if found is None or (found.stable and found.peak <= S_max):
-        return look
+        return design
     at = f"as sampled at {k.rate_hz:.4g} Hz with a delay of {k.delay_us:.4g} µs"
     if not found.stable:
-        return replace(look, standing=Standing.REFUSED, reason=f"the loop is unstable {at}")
-    if look.standing is not Standing.KEPT:
-        return look  # it is no better already
+        return replace(design, standing=Standing.REFUSED, reason=f"the loop is unstable {at}")
+    if design.standing is not Standing.KEPT:
+        return design  # it is no better already
     over = missed_by(found.peak, S_max)
-    return replace(look, standing=Standing.MISSED, reason=f"{at} the peak of S is {over}")
+    return replace(design, standing=Standing.MISSED, reason=f"{at} the peak of S is {over}")
 
 
 def as_sampled(
@@ -150,7 +150,7 @@ def as_sampled(
 
 
 def standing_html(
-    look: Look, curves: Curves | None, sampled: AsSampled | None,
+    design: ExploredDesign, curves: Curves | None, sampled: AsSampled | None,
     beside: tuple[str, float] | None = None,
 ) -> str:  # fmt: skip
     """The verdict, ω_b and the figures, what it survives, how it was chosen and on which plant.
@@ -159,7 +159,7 @@ def standing_html(
     """
     known = beside is not None and np.isfinite(beside[1])
     return template("extensions/explorer/assets/standing.html", number=number, HZ=HZ).render(
-        look=look, beside=beside if known else None, curves=curves, sampled=sampled,
+        design=design, beside=beside if known else None, curves=curves, sampled=sampled,
     )  # fmt: skip
 
 
@@ -170,15 +170,15 @@ def move_words(curves: Curves | None) -> str:
     return f"the default one of robustness, {curves.move.words}"
 
 
-def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
+def machine_html(design: ExploredDesign, start: Sequence[float], reference: float) -> str:
     """Its drawing beside that of the start, masses and springs, or its modes."""
-    plant = plant_of(look.problem)
+    plant = plant_of(design.problem)
     if plant.drawing is not None:
-        drawn = plant.drawing({"this design": look.theta, "the start": start}).drawing
+        drawn = plant.drawing({"this design": design.theta, "the start": start}).drawing
         if isinstance(drawn, Lines):  # the first row alone: it is drawn while one drags
             drawn = replace(drawn, rows=drawn.rows[:1], heights=drawn.heights[:1])
         return f'<div class="drawn">{block_html(drawn, "machine")}</div>'
-    return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
+    return block_html(lumped_machine(design.elements.system, design.modal, reference), "machine")
 
 
 def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
@@ -211,7 +211,7 @@ SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 EMPTY = Panel("", "")
 UNSTABLE = Area(np.array([1e-9, 1e12, 1e12, 1e-9]), np.array([-9.0, -9.0, 0.0, 0.0]))
 # Standing -> colour and dashes of a design's curves; no dashes: each as its panel has it.
-LOOKS = {
+STYLES = {
     Standing.KEPT: (BLUE, ""), Standing.MISSED: (AMBER, ""), Standing.NEAR: (GREY, ":"),
     Standing.REFUSED: (GREY, "--"),
 }  # fmt: skip
@@ -221,18 +221,21 @@ LOOKS = {
 class Drawn:
     """A design, and the panels that show it by the name of their figure; none without curves."""
 
-    look: Look
+    design: ExploredDesign
     panels: Mapping[str, Panel]
 
 
 def drawn(
-    look: Look, c: Curves | None, sampled: AsSampled | None, notched: Notched | None = None
+    design: ExploredDesign,
+    c: Curves | None,
+    sampled: AsSampled | None,
+    notched: Notched | None = None,
 ) -> Drawn:
     """The panels of a design (no curves: it has no controller), with the loop as sampled and the
     one with a notch where they are wanted."""
     if c is None:
-        return Drawn(look, {})
-    certified, view = look.standing is not Standing.REFUSED, c.view
+        return Drawn(design, {})
+    certified, view = design.standing is not Standing.REFUSED, c.view
     S, KS, T = gain_panels([view], bounds=certified)
     if sampled is not None:
         late = Curve(sampled.hz, sampled.gain, "as sampled", PURPLE, "-.", width=1.6)
@@ -252,7 +255,7 @@ def drawn(
         "move": _over_time(c.move.time, 1e6 * c.move.error, "error (µm)",
                            Level(1e3 * c.move.duration, "end of the move", True)),
     }  # fmt: skip
-    return Drawn(look, panels if notched is None else notched.on(panels))
+    return Drawn(design, panels if notched is None else notched.on(panels))
 
 
 def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:
@@ -262,8 +265,8 @@ def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -
 def _poles(c: Curves) -> Panel:
     """Of the plant, of K and of the loop: frequency and damping."""
     curves = []
-    looks = (("plant", GREY, "o"), ("controller", GREEN, "^"), ("closed loop", BLUE, "x"))
-    for roots, (label, colour, marker) in zip(c.poles, looks, strict=True):
+    drawn_designs = (("plant", GREY, "o"), ("controller", GREEN, "^"), ("closed loop", BLUE, "x"))
+    for roots, (label, colour, marker) in zip(c.poles, drawn_designs, strict=True):
         hz, damping = frequency_and_damping(roots)
         hz = np.maximum(hz, SLOWEST * c.view.ends[0])  # an integrator's has no place there
         curves.append(Curve(hz, damping, label, colour, "", marker))

@@ -92,7 +92,7 @@ OWN = VerdictOptions().least_shift
 
 
 @dataclass(frozen=True)
-class Look:
+class ExploredDesign:
     """A design that was looked at: where, on which plant, what it is worth.
 
     `figures` (rad/s) are NaN past the point where a synthesis failed; `reason` says in words why
@@ -148,19 +148,22 @@ def elements_at(problem: CoDesignProblem, theta: Sequence[float]) -> Elements:
 
 def present(
     problem: CoDesignProblem, knobs: Knobs, elements: Elements, point: tuple[float, float]
-) -> Look:
+) -> ExploredDesign:
     """One certified synthesis at θ and `point` = (ω_S, ω_T) in rad/s, clipped to the ranges."""
     began = perf_counter()
     inner = problem.inner
     point = (float(np.clip(point[0], *inner.omega_S)), float(np.clip(point[1], *inner.omega_T)))
     choices = design_choices(problem)
-    looks = [_look(choice, knobs, elements, point, How.PRESENT, began) for choice in choices]
+    drawn_designs = [
+        _design(choice, knobs, elements, point, How.PRESENT, began) for choice in choices
+    ]
     return min(
-        looks, key=lambda look: float(np.nan_to_num(look.figures.sensitivity_peak, nan=np.inf))
+        drawn_designs,
+        key=lambda design: float(np.nan_to_num(design.figures.sensitivity_peak, nan=np.inf)),
     )
 
 
-def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> Look:
+def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> ExploredDesign:
     """The inner problem at θ, as the command `inner` solves it, and the controller there.
 
     Where no design is feasible: the one nearest to it, if any was certified.
@@ -170,25 +173,25 @@ def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> Look
     if found.optimum is not None:
         figures = found.optimum.figures
         point = (figures.omega_S, figures.omega_T)
-        look = _look(choice, knobs, elements, point, How.SEARCHED, began)
-        return replace(look, result=found)
+        design = _design(choice, knobs, elements, point, How.SEARCHED, began)
+        return replace(design, result=found)
     certified = [row for row in found.rows if row.certified]
     row = min(certified or found.rows, key=choice.inner.excess)
-    look = _look(choice, knobs, elements, (row.omega_S, row.omega_T), How.SEARCHED, began)
-    standing = Standing.MISSED if look.standing is Standing.KEPT else look.standing
-    return replace(look, standing=standing, reason=found.shortfall, result=found)
+    design = _design(choice, knobs, elements, (row.omega_S, row.omega_T), How.SEARCHED, began)
+    standing = Standing.MISSED if design.standing is Standing.KEPT else design.standing
+    return replace(design, standing=standing, reason=found.shortfall, result=found)
 
 
-def _look(
+def _design(
     problem: CoDesignProblem,
     knobs: Knobs,
     elements: Elements,
     point: tuple[float, float],
     how: How,
     began: float,
-) -> Look:
-    look = without_controller(problem, knobs, elements, how)
-    weights, inner, plant = problem.weights.at(*point), problem.inner, look.plant
+) -> ExploredDesign:
+    design = without_controller(problem, knobs, elements, how)
+    weights, inner, plant = problem.weights.at(*point), problem.inner, design.plant
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
     made = recertified_in_si(plant, made, inner.omega_low)
     standing, reason = judged(problem, made.figures, violated(problem, knobs.theta))
@@ -196,7 +199,7 @@ def _look(
         standing, reason = Standing.NEAR, ""
     finite = all(np.isfinite(getattr(made.controller, part)).all() for part in "ABCD")
     return replace(
-        look, weights=weights, figures=made.figures,
+        design, weights=weights, figures=made.figures,
         controller=made.controller if finite and made.controller.A.size else None,
         standing=standing, reason=reason,
         active=active_constraints(inner, made.figures) if standing is Standing.KEPT else (),
@@ -206,9 +209,9 @@ def _look(
 
 def without_controller(
     problem: CoDesignProblem, knobs: Knobs, elements: Elements, how: How, words: str = ""
-) -> Look:
+) -> ExploredDesign:
     """A place without a controller, and why."""
-    return Look(
+    return ExploredDesign(
         knobs=knobs,
         problem=problem,
         elements=elements,
@@ -284,7 +287,7 @@ def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:
     )
 
 
-def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> Look:
+def judged_design(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> ExploredDesign:
     """A known controller at θ, judged on the model and the corners of its plant set."""
     began = perf_counter()
     controller = structure_of(problem).state_space(kappa)
@@ -294,9 +297,9 @@ def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) 
     standing, reason = _standing(found)
     if standing is Standing.KEPT and broken:
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"
-    look = without_controller(problem, knobs, elements, how, reason)
+    design = without_controller(problem, knobs, elements, how, reason)
     return replace(
-        look, figures=_figures(found, look.figures), controller=controller, standing=standing,
+        design, figures=_figures(found, design.figures), controller=controller, standing=standing,
         kappa=kappa, seconds=perf_counter() - began,
     )  # fmt: skip
 

@@ -117,14 +117,14 @@ class Background:
         self._asking, self._thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._closed = False
 
-    def ask(self, work: Callable[[Any, Tell], Any], task: Any, told: Tell = silent) -> Future:
+    def ask(self, work: Callable[[Any, Tell], Any], task: Any, heard: Tell = silent) -> Future:
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
 
         def answered() -> Any:
             process = self._process = self._process or WorkerProcess()
             process.begin(_working, (self._user_code, work, task))
             try:
-                done, value = process.answer(told=told)
+                done, value = process.answer(reported=heard)
             except WorkerLost:
                 self._process = None
                 raise
@@ -188,11 +188,11 @@ class Solve:
                     tell(line.rstrip())
             ended(self._process.wait())
 
-        self._asked = False
+        self._interrupted = False
         threading.Thread(target=read, daemon=True).start()
 
     def stop(self) -> None:
         """As Ctrl-C does, and what is sampled is kept; asked again, without more ado."""
         if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM if self._asked else signal.SIGINT)
-            self._asked = True
+            self._process.send_signal(signal.SIGTERM if self._interrupted else signal.SIGINT)
+            self._interrupted = True

@@ -88,7 +88,7 @@ class MapFigure:
     """Two choices of a parameter, the map over them, what it shows; `asked` when one is chosen."""
 
     def __init__(
-        self, parameters: Sequence[Parameter], asked: Callable[[], None], dark: bool
+        self, parameters: Sequence[Parameter], chosen: Callable[[], None], dark: bool
     ) -> None:
         self.names: list[Any] = [parameter.name for parameter in parameters]
         self._units = [display_unit(item.unit, item.upper) for item in parameters]
@@ -99,7 +99,7 @@ class MapFigure:
             for i, title in enumerate(("across", "up"))
         ]  # fmt: skip
         for select in self._selects:
-            select.on_change("value", lambda attr, old, new: asked())
+            select.on_change("value", lambda attr, old, new: chosen())
         self._colours = LinearColorMapper(palette="Viridis256", nan_color="#80808050")
         self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
         self._dots = ColumnDataSource({"x": [], "y": [], "hz": []})

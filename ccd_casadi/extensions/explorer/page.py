@@ -20,8 +20,8 @@ from ccd_casadi.extensions.explorer.controls import Controls, PlacesFigure, butt
 from ccd_casadi.extensions.explorer.curves import (
     EMPTY,
     FIGURES,
-    LOOKS,
     OVER_HZ,
+    STYLES,
     Drawn,
     curves_of,
     drawn,
@@ -31,7 +31,7 @@ from ccd_casadi.extensions.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.extensions.explorer.designs import Designed, How, Look, anchored, designed
+from ccd_casadi.extensions.explorer.designs import Designed, ExploredDesign, How, anchored, designed
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.landscape_map import (
@@ -95,7 +95,7 @@ class ExplorerPage:
         self._open, self._moves = True, 0
         self._scheduled = self._let_go = self._of_search = self._notching = False
         self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
-        self._seen: list[Look] = []  # to be written into the store
+        self._seen: list[ExploredDesign] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
         known = known_bandwidths(problem, self._surrogate, read_truths(session.store.path, problem))
@@ -179,7 +179,7 @@ class ExplorerPage:
 
     def improved(self) -> None:
         """The model of a slow plant was made anew: draw what is not the plant's own on it."""
-        if self.now is not None and not self.now.look.elements.exact:
+        if self.now is not None and not self.now.design.elements.exact:
             self.moved(False)
 
     def _answer(self) -> None:
@@ -193,12 +193,12 @@ class ExplorerPage:
         behind = full and self.session.known is not None
         try:
             here = full and not behind
-            look = self.session.full(knobs) if here else self.session.live(knobs)
+            design = self.session.full(knobs) if here else self.session.live(knobs)
         except UserError as error:
             self._complain(str(error))
             return
         self.note.text = ""
-        self.show(look)
+        self.show(design)
         if behind:
             self._search_behind(knobs)
         if let_go:
@@ -209,40 +209,44 @@ class ExplorerPage:
     def _complain(self, words: str) -> None:
         self.note.text = f'<p class="refused">{escape(words)}</p>'
 
-    def show(self, look: Look) -> None:
+    def show(self, design: ExploredDesign) -> None:
         """Draw a design, and say that this is the answer."""
-        sampled = sampled_of(look) if look.knobs.sampled else None
-        look = with_sampled(look, sampled)
-        self._shown = look, curves_of(look), sampled
+        sampled = sampled_of(design) if design.knobs.sampled else None
+        design = with_sampled(design, sampled)
+        self._shown = design, curves_of(design), sampled
         self._paint()
-        self._seen.append(look)
-        if self._first is None and look.how is not How.PRESENT:
-            self._first = "the first one", look.bandwidth_hz
+        self._seen.append(design)
+        if self._first is None and design.how is not How.PRESENT:
+            self._first = "the first one", design.bandwidth_hz
 
     def _paint(self) -> None:
         """The present design, with its notch."""
-        look, curves, sampled = self._shown
+        design, curves, sampled = self._shown
         session, view = self.session, None if curves is None else curves.view
         notched = None if view is None else self.notch.of(view)
-        self.now = now = drawn(look, curves, sampled, notched)
+        self.now = now = drawn(design, curves, sampled, notched)
         self._serial += 1
-        answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
+        answer = {
+            "serial": [self._serial],
+            "theta": [list(design.theta)],
+            "how": [design.how.value],
+        }
         pinned = self.pins.pinned
-        beside = (pinned[-1][0], pinned[-1][1].look.bandwidth_hz) if pinned else self._first
-        colour, dash = LOOKS[look.standing]
+        beside = (pinned[-1][0], pinned[-1][1].design.bandwidth_hz) if pinned else self._first
+        colour, dash = STYLES[design.standing]
         words = {
-            "verdict": standing_html(look, curves, sampled, beside),
-            "machine": machine_html(look, session.start.theta, session.reference),
-            "say_notch": escape(NO_NOTCH if notched is None else notched.words(look.knobs.S_max)),
+            "verdict": standing_html(design, curves, sampled, beside),
+            "machine": machine_html(design, session.start.theta, session.reference),
+            "say_notch": escape(NO_NOTCH if notched is None else notched.words(design.knobs.S_max)),
         } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY), colour)
              for made in self.figures}  # fmt: skip
         words["say_move"] = move_words(curves)
         colour = ON_DARK.get(colour, colour) if self._dark else colour
-        frame = look.how is not How.PRESENT and curves is not None
+        frame = design.how is not How.PRESENT and curves is not None
         changes = [change for made in self.figures for change in
                    made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
-        changes += [made.marks(look.theta) for made in self.places]
-        changes += [self.notch.mark(view), self.map.mark(look.theta)]
+        changes += [made.marks(design.theta) for made in self.places]
+        changes += [self.notch.mark(view), self.map.mark(design.theta)]
         self._message.send(words, [*changes, (self.answer, {"data": answer})])
 
     def _notch_moved(self) -> None:
@@ -270,11 +274,13 @@ class ExplorerPage:
             return
         run, store = self.session.run, self.session.store.path
         made_for = None if run is None else run.problem
-        look = self.now.look
+        design = self.now.design
         self.map.show(
-            *landscape_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
+            *landscape_of(
+                design.problem, design.theta, made_for, self._surrogate, store, self.map.axes
+            )
         )
-        here, new = self.map.mark(look.theta)
+        here, new = self.map.mark(design.theta)
         here.update(**new)
 
     # the background
@@ -297,25 +303,25 @@ class ExplorerPage:
             search = self.background.ask(searched_exactly, task)
             self.background.answer(search, self._then(self._searched), self._then(self._failed))
 
-    def _searched(self, found: tuple[Look, str]) -> None:
-        look, modes = found
+    def _searched(self, found: tuple[ExploredDesign, str]) -> None:
+        design, modes = found
         newest, self._newest = self._newest, None
         known = self.session.known
         assert known is not None
         self.note.text = ""
         count = len(known.exact)
-        off = self.session.took(look)
+        off = self.session.took(design)
         if off is not None:
             words = f"the frequencies drawn while you dragged were off by {100.0 * off:.2g} % here"
             self.note.text = f"<p>{words}</p>"
         if len(known.exact) > count:
             self.background.renew(known, self._then(lambda _: self.improved()))
         self.modes.text = modes
-        if newest in (None, look.knobs) and self.controls.knobs() == look.knobs:
-            self.show(look)
+        if newest in (None, design.knobs) and self.controls.knobs() == design.knobs:
+            self.show(design)
         else:
-            self._seen.append(look)
-        if newest is not None and newest != look.knobs:
+            self._seen.append(design)
+        if newest is not None and newest != design.knobs:
             self._search_behind(newest)
         self.settle()
 
@@ -327,7 +333,7 @@ class ExplorerPage:
         """A controller of fixed structure at this θ."""
         knobs = self.controls.knobs()
         problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
-        self.waits_for(self.background.ask(designed, (problem, knobs), self.told))
+        self.waits_for(self.background.ask(designed, (problem, knobs), self.heard))
 
     def waits_for(self, design: Future) -> None:
         """A design is under way, which this page shows once it ends."""
@@ -335,7 +341,7 @@ class ExplorerPage:
         self._designing("it takes seconds")
         self.background.answer(design, self._then(self._designed), self._then(self._failed))
 
-    def told(self, words: str) -> None:
+    def heard(self, words: str) -> None:
         """How far a design is, in any thread."""
         self._then(self._designing)(words)
 
@@ -345,11 +351,11 @@ class ExplorerPage:
 
     def _designed(self, found: Designed) -> None:
         self.design.disabled, self._designs, self.note.text = False, False, ""
-        look = self.session.took_designed(found)
-        if look is None:
+        design = self.session.took_designed(found)
+        if design is None:
             self._complain(found.words)
         elif found.knobs == self.controls.knobs():
-            self.show(look)
+            self.show(design)
             self.settle()
         else:  # the sliders moved meanwhile: it is judged where they are
             self.moved(True)
@@ -362,7 +368,7 @@ class ExplorerPage:
     def go(self) -> None:
         """Move the sliders to the selected pin."""
         if (pinned := self.pins.selected()) is not None:
-            self.controls.put(pinned.look.knobs)
+            self.controls.put(pinned.design.knobs)
             self.moved(True)
 
     def write_case(self) -> None:

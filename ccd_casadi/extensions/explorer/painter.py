@@ -142,10 +142,10 @@ class PanelFigure:
         made = self.figure
         made.patches("xs", "ys", source=self._areas, fill_color="colour", fill_alpha="alpha",
                      line_color=None)  # fmt: skip
-        look = {"line_color": "colour", "line_dash": "dash", "line_width": "width"}
+        design = {"line_color": "colour", "line_dash": "dash", "line_width": "width"}
         for source in (self._lines, self._pins):
-            made.multi_line("xs", "ys", source=source, **look)
-        own = made.multi_line("xs", "ys", source=self.own, **look)
+            made.multi_line("xs", "ys", source=source, **design)
+        own = made.multi_line("xs", "ys", source=self.own, **design)
         made.scatter("x", "y", source=self._spots, marker="marker", size=8, line_color="colour",
                      fill_alpha=0.0, line_width=1.6)  # fmt: skip
         made.text("x", "y", "text", source=self._words, text_color="colour", x_offset="dx",

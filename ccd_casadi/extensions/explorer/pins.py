@@ -17,7 +17,7 @@ from bokeh.models.widgets.tables import (
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
 from ccd_casadi.extensions.explorer.curves import EMPTY, Drawn
-from ccd_casadi.extensions.explorer.designs import Look
+from ccd_casadi.extensions.explorer.designs import ExploredDesign
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.landscape_map import MapFigure
 from ccd_casadi.extensions.explorer.painter import ON_DARK, PanelFigure
@@ -29,13 +29,13 @@ COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
 DARK = """.slick-cell, .slick-header-column { background: #20262b !important; color: #e0e0e0; }
 .slick-cell.selected { background: #2f4a5e !important; }"""
 # Of a pinned design: field, title, format, width in px, and what it reads.
-FIGURES: tuple[tuple[str, str, str, int, Callable[[Look], Any]], ...] = (
-    ("S_max", "S_max", "0.000", 70, lambda look: look.knobs.S_max),
-    ("bandwidth", "ω_b (Hz)", "0.0000", 90, lambda look: look.bandwidth_hz),
-    ("peak", "‖S‖∞", "0.0000", 80, lambda look: look.figures.sensitivity_peak),
-    ("cost", "hardware cost", "0.0000", 130, lambda look: look.cost),
-    ("objective", "J", "0.0000", 110, lambda look: look.objective),
-    ("standing", "standing", "", 260, lambda look: look.standing.value),
+FIGURES: tuple[tuple[str, str, str, int, Callable[[ExploredDesign], Any]], ...] = (
+    ("S_max", "S_max", "0.000", 70, lambda design: design.knobs.S_max),
+    ("bandwidth", "ω_b (Hz)", "0.0000", 90, lambda design: design.bandwidth_hz),
+    ("peak", "‖S‖∞", "0.0000", 80, lambda design: design.figures.sensitivity_peak),
+    ("cost", "hardware cost", "0.0000", 130, lambda design: design.cost),
+    ("objective", "J", "0.0000", 110, lambda design: design.objective),
+    ("standing", "standing", "", 260, lambda design: design.standing.value),
 )
 LINE = '<span style="color:<%= value %>">▬▬</span>'
 
@@ -110,20 +110,21 @@ class Pins:
 
     def _columns(self, colours: Sequence[str]) -> dict[str, list[Any]]:
         """The table, a list a column; θ in the units of the sliders."""
-        looks = [drawn.look for _, drawn in self.pinned[: len(colours)]]
+        drawn_designs = [drawn.design for _, drawn in self.pinned[: len(colours)]]
         found: dict[str, list[Any]] = {
             "colour": [*colours], "design": [name for name, _ in self.pinned[: len(colours)]]
         }  # fmt: skip
         for i, (name, scale) in enumerate(zip(self.names, self._scales, strict=True)):
-            found[f"theta_{name}"] = [scale * look.theta[i] for look in looks]
+            found[f"theta_{name}"] = [scale * design.theta[i] for design in drawn_designs]
         return found | {
-            name: json_values([read(look) for look in looks]) for name, *_, read in FIGURES
+            name: json_values([read(design) for design in drawn_designs])
+            for name, *_, read in FIGURES
         }
 
     def _on_map(self) -> None:
         """Whoever looks at the table finds each there by colour and name."""
         rows = enumerate(self.pinned)
-        self.land.pin([(COLOURS[i % len(COLOURS)], name, drawn.look.theta)
+        self.land.pin([(COLOURS[i % len(COLOURS)], name, drawn.design.theta)
                        for i, (name, drawn) in rows])  # fmt: skip
 
     def _show(self) -> None:
@@ -138,8 +139,8 @@ class Pins:
 
 
 def _column(name: str, title: str, form: str, width: int) -> TableColumn:
-    look: dict[str, Any] = {"editor": StringEditor() if name == "design" else CellEditor()}
+    design: dict[str, Any] = {"editor": StringEditor() if name == "design" else CellEditor()}
     if form:
         made = HTMLTemplateFormatter(template=form) if "<" in form else NumberFormatter(format=form)
-        look["formatter"] = made
-    return TableColumn(field=name, title=title, width=width, **look)
+        design["formatter"] = made
+    return TableColumn(field=name, title=title, width=width, **design)

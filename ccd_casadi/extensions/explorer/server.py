@@ -90,12 +90,12 @@ class Explorer:
         is."""
         session = self.session
 
-        def told(words: str) -> None:
+        def heard(words: str) -> None:
             for page in list(self._pages):
-                page.told(words)
+                page.heard(words)
 
         task = (session.problems.at(session.start), session.start)
-        return self.background.ask(designed, task, told)
+        return self.background.ask(designed, task, heard)
 
     def _document(self, document: Document) -> None:
         context = document.session_context

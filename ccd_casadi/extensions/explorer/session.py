@@ -15,11 +15,11 @@ from ccd_casadi.extensions.explorer.curves import surface_modes_html
 from ccd_casadi.extensions.explorer.designs import (
     Designed,
     Elements,
+    ExploredDesign,
     How,
-    Look,
     anchored,
     elements_at,
-    judged_look,
+    judged_design,
     present,
     searched,
     without_controller,
@@ -98,7 +98,7 @@ class Session:
         """The plant's matrices at θ as fast as one drags."""
         return elements_at(problem, theta) if self.known is None else self.known.at(theta)
 
-    def live(self, knobs: Knobs) -> Look:
+    def live(self, knobs: Knobs) -> ExploredDesign:
         """One certified synthesis at the weights of the last search.
 
         Of a fixed structure: the last controller, judged at this θ.
@@ -109,15 +109,15 @@ class Session:
         elements = self.elements(problem, knobs.theta)
         return present(problem, knobs, elements, (self.point[0], self.point[1]))
 
-    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> Look:
+    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> ExploredDesign:
         problem = anchored(problem, self.designed_for)
         if self.kappa is None:
             elements = elements_at(problem, knobs.theta)
             words = "no controller yet: design one here"
             return without_controller(problem, knobs, elements, How.STRUCTURED, words)
-        return judged_look(problem, knobs, self.kappa, How.HELD)
+        return judged_design(problem, knobs, self.kappa, How.HELD)
 
-    def took_designed(self, found: Designed) -> Look | None:
+    def took_designed(self, found: Designed) -> ExploredDesign | None:
         """A design of a fixed structure ended: into the store, and the controller of looks to come.
 
         None where no controller was found.
@@ -128,59 +128,59 @@ class Session:
         if found.kappa is None:
             return None
         self.kappa, self.designed_for = found.kappa, found.problem
-        return judged_look(found.problem, found.knobs, found.kappa, How.STRUCTURED)
+        return judged_design(found.problem, found.knobs, found.kappa, How.STRUCTURED)
 
-    def full(self, knobs: Knobs) -> Look:
+    def full(self, knobs: Knobs) -> ExploredDesign:
         """The inner problem at θ on the model itself."""
         problem = self.problems.at(knobs)
-        look = searched(problem, knobs, elements_at(problem, knobs.theta))
-        self.search_seconds = look.seconds
-        self.took(look)
-        return look
+        design = searched(problem, knobs, elements_at(problem, knobs.theta))
+        self.search_seconds = design.seconds
+        self.took(design)
+        return design
 
     @property
     def quick(self) -> bool:
         """Whether a full search is over within a drag's patience."""
         return self.known is None and self.search_seconds < SessionOptions.quick
 
-    def took(self, look: Look) -> float | None:
+    def took(self, design: ExploredDesign) -> float | None:
         """A full search ended: its weights are those of the syntheses to come.
 
         How far off the model of a slow plant was at this θ, relative; None where there was none.
         """
-        self.point = (look.figures.omega_S, look.figures.omega_T)
-        if self.known is None or not look.elements.exact:
+        self.point = (design.figures.omega_S, design.figures.omega_T)
+        if self.known is None or not design.elements.exact:
             return None
-        return self.known.learn(look.theta, look.elements.system)
+        return self.known.learn(design.theta, design.elements.system)
 
-    def keep(self, looks: Sequence[Look]) -> None:
+    def keep(self, drawn_designs: Sequence[ExploredDesign]) -> None:
         """Write designs that were looked at into the store: a search with every synthesis of it.
 
         What was made on other matrices than the model's is kept as another problem's.
         """
-        for look in looks:
-            problem = look.problem.identity()
-            if look.how is How.STRUCTURED:
+        for design in drawn_designs:
+            problem = design.problem.identity()
+            if design.how is How.STRUCTURED:
                 continue  # with its unit, or there is none
-            if look.kappa is not None:
-                problem = problem | {"held": [float(v) for v in look.kappa]}
-            if not look.elements.exact:
-                problem = problem | {"elements": look.elements.words}
+            if design.kappa is not None:
+                problem = problem | {"held": [float(v) for v in design.kappa]}
+            if not design.elements.exact:
+                problem = problem | {"elements": design.elements.words}
             key = problem_hash(problem)
             self.store.put_problem(key, problem)
-            if look.result is None:
-                f = look.figures
-                own = sample_key(key, look.theta, f.omega_S, f.omega_T)
-                self.store.put([sample_of(own, look.theta, f, look.seconds)], key)
+            if design.result is None:
+                f = design.figures
+                own = sample_key(key, design.theta, f.omega_S, f.omega_T)
+                self.store.put([sample_of(own, design.theta, f, design.seconds)], key)
                 continue
-            each = look.seconds / max(look.result.syntheses, 1)
-            rows, payload = unit_of(key, look.theta, look.result, look.problem.inner, each)
-            optimum = look.result.optimum
-            if optimum is not None and optimum.to_theta.shape[1] != len(look.theta):
+            each = design.seconds / max(design.result.syntheses, 1)
+            rows, payload = unit_of(key, design.theta, design.result, design.problem.inner, each)
+            optimum = design.result.optimum
+            if optimum is not None and optimum.to_theta.shape[1] != len(design.theta):
                 self.store.put(rows, key)  # of matrices without derivatives: no sample of ω_b*(θ)
                 continue
-            inner = hashes_of(look.problem)[1]
-            unit = (sample_key(inner, look.theta), inner, look.theta, payload)
+            inner = hashes_of(design.problem)[1]
+            unit = (sample_key(inner, design.theta), inner, design.theta, payload)
             self.store.put_unit(rows, unit, key)
 
     def save(self, knobs: Knobs) -> Path:
@@ -202,7 +202,7 @@ class Session:
         return next(place for place in places if not place.exists())
 
 
-def searched_exactly(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> tuple[Look, str]:
+def searched_exactly(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> tuple[ExploredDesign, str]:
     """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
     problem, knobs = task
     elements = elements_at(problem, knobs.theta)

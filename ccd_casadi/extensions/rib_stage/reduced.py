@@ -213,11 +213,13 @@ def _grown(
     vectors, inverse = found.vectors, found.pencil.inverse
     acting = [*points_of(stage), *((p.x, p.y) for p in masses)]
     for image in group.images:
-        bent = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[0]
+        bending = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[
+            0
+        ]
         for _ in range(options.levels):
-            bent = inverse(bent)
-            vectors = np.hstack([vectors, bent])
-            bent = found.pencil.mass(bent)
+            bending = inverse(bending)
+            vectors = np.hstack([vectors, bending])
+            bending = found.pencil.mass(bending)
     basis = _wider(stage, disc, group, basis, vectors, options.known_mode)
     moved = disc.assembler.moved(sector, theta, found.values, found.vectors)
     return _wider(stage, disc, group, basis, inverse(moved), options.known_slope)
@@ -322,8 +324,8 @@ def _lowest(
     (m,), G (m, 3, p) being the displacements there."""
     few, shift = min(coupled, len(values)), StageModeOptions.shift
     high = values[few:]
-    bent = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + shift)[:, None]
-    Q = compressed(np.hstack([bent, bent / (high + shift)[:, None] * shift]))[0]
+    bending = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + shift)[:, None]
+    Q = compressed(np.hstack([bending, bending / (high + shift)[:, None] * shift]))[0]
     own, turn = np.linalg.eigh(Q.T @ (high[:, None] * Q))
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 

@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import prepared, race, with_range
+from ccd_casadi.inner_problem.structured_search import prepared, search_starts, with_range
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
@@ -291,7 +291,7 @@ def refined(
         segment.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
         warm_starts=(tuple(map(float, segment.design.kappa)),),
     )  # fmt: skip
-    made = race(problem, theta, tell, workers, True)
+    made = search_starts(problem, theta, tell, workers, True)
     if not made.certified:
         return segment
     part = DesignedPart(segment.low, segment.high, problem, made)

@@ -14,7 +14,7 @@ from ccd_casadi.codesign.run import within
 from ccd_casadi.extensions.tolerances.of_case import Tolerances
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
-from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, search_share
+from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -110,7 +110,7 @@ def design_for_share(
             problem, whole, at = verified.problem, verified.design, verified.theta
     kappa = None if whole is None else whole.kappa
     with within_budget(minutes):
-        first = begun(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, tell)
+        first = started(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, tell)
         found = search_share(first, tell, moves=theta is None)
     design = recertified(found.problem, found.best.theta, found.design)
     on_box = DesignOnBox(found.problem, found.best.theta, design)

@@ -208,7 +208,7 @@ def scenario_of(machine: Machine) -> Scenario:
     return option, tuple(map(float, point))
 
 
-def begun(
+def started(
     sampler: Sampler, theta: tuple[float, ...], kappa: Array | None, plan: Plan,
     distribution: Mapping[str, str], seed: int, tell: Tell,
 ) -> ShareSearch:  # fmt: skip

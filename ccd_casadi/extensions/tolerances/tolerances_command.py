@@ -64,8 +64,8 @@ def main(options: argparse.Namespace) -> ExitCode:
             answer = share_answer(design_for_share(of, sampler, theta, options.seed, minutes))
         else:
             answer = price_answer(run, sampler, options.quiet)
-    told = {"seed": options.seed, "seconds": options.seconds(), "versions": versions()}
-    write_json(folder / "tolerances.json", answer.entry | told)
+    reported = {"seed": options.seed, "seconds": options.seconds(), "versions": versions()}
+    write_json(folder / "tolerances.json", answer.entry | reported)
     for name, content in answer.files.items():
         if isinstance(content, str):
             (folder / name).write_text(content, "utf-8")
