@@ -80,3 +80,18 @@ def test_documented_parameters_are_those_of_the_signature() -> None:
                 found = set(documented(ast.get_docstring(node) or "")) - own
                 wrong |= {f"{module}.{node.name}": found} if found else {}
     assert wrong == {}
+
+
+# Words of conversation that name nothing; each has a term of the field.
+NO_NAMES = {"told", "asked", "look", "looks", "looked", "bent", "begun", "race", "raced", "stands"}
+
+
+def test_names_are_words_of_the_field() -> None:
+    found = {
+        name
+        for _, tree, _ in structure.trees(structure.OURS)
+        for node in ast.walk(tree)
+        for name in (getattr(node, field, None) for field in ("name", "id", "arg", "attr"))
+        if isinstance(name, str) and NO_NAMES & set(name.lower().strip("_").split("_"))
+    }
+    assert sorted(found) == []

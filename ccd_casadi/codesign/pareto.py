@@ -104,13 +104,13 @@ def pareto_front(
         The hardware cost is constant, or `own` has no certified design.
     """
     problem, plant = sampler.problem, plant_of(sampler.problem)
-    looked = np.vstack([own, design("sobol", *box(problem), options.costs, seed)])
-    costs = np.array([hardware_cost(plant, theta) for theta in looked])
+    examined = np.vstack([own, design("sobol", *box(problem), options.costs, seed)])
+    costs = np.array([hardware_cost(plant, theta) for theta in examined])
     f_range = np.ptp(costs)
     if not f_range > options.constant * np.abs(costs).max():
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
-    allowed = [i for i in np.argsort(costs) if not violated(problem, looked[i])]
-    started = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
+    allowed = [i for i in np.argsort(costs) if not violated(problem, examined[i])]
+    started = sampler.values(examined[[0, allowed[0], allowed[-1]]], "starts of the front")
     if not started[0].feasible:
         raise UserError(f"the run's design is not certified: {started[0].shortfall}")
     started = [sample for sample in started if sample.feasible]

@@ -220,13 +220,13 @@ def climbed(
     """The worst plants found from these points (option, point) on, the worst first, and how many
     were assessed; of those within every bound the worst alone."""
     loops = loop.assessed(loop.uncertain.plants(points))
-    peaks, looked = _distinct(points, loops, options), len(points)
+    peaks, examined = _distinct(points, loops, options), len(points)
     ends: list[Peak] = []
     for _ in range(options.climbs):
         steps = _towards_corners(loop, peaks, options)
         if not steps:
             break
-        looked += len(steps)
+        examined += len(steps)
         moved = _moved(loop, peaks, steps, options.near)
         rising = [after.value > before.value + options.least_gain
                   and after.value < loop.unstable
@@ -238,7 +238,7 @@ def climbed(
     lost = [Excess(*points[i], float(loops.largest[i])) for i in _unstable(loops)]
     over = [end for end in ends if end.value > 0.0] or ends[:1]
     found = [*lost, *_apart(loop, over, options)]
-    return sorted(found, key=lambda end: -end.value), looked
+    return sorted(found, key=lambda end: -end.value), examined
 
 
 def _apart(loop: LoopOnBox, peaks: Sequence[Peak], options: WorstPlantOptions) -> list[Excess]:
@@ -390,10 +390,10 @@ def worst_plants(
         return climbed(loop, [*points, *meetings(uncertain)], options)
     points = lattice(uncertain, count, seed, along=along)
     value = loop.excesses(points, workers)
-    looked, first = len(points), np.argsort(-value)[: options.searches]
+    examined, first = len(points), np.argsort(-value)[: options.searches]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
-        return heads, looked
+        return heads, examined
     box = uncertain.box
     step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
     for _ in range(options.rounds):
@@ -410,8 +410,8 @@ def worst_plants(
         for (row, point), end in zip(moves, ends, strict=True):
             if end > heads[row].value:
                 heads[row] = Excess(heads[row].option, point, end)
-        looked, step = looked + len(moves), 0.5 * step
-    return sorted(heads, key=lambda head: -head.value), looked
+        examined, step = examined + len(moves), 0.5 * step
+    return sorted(heads, key=lambda head: -head.value), examined
 
 
 def _sharp(

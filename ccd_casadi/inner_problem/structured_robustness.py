@@ -309,16 +309,16 @@ def violations(
                 found.append((head.option, tuple(map(float, head.point))))
         return tuple(found)
 
-    looked = 0
+    examined = 0
     for along in (lines.along_first, lines.along) if uncertain.ranges else (lines.along,):
         seed = structured.seed + turn
         heads, more = worst_plants(loop, seed, count, workers=workers, along=along)
-        heads, looked = sorted([*before, *heads], key=lambda head: -head.value), looked + more
+        heads, examined = sorted([*before, *heads], key=lambda head: -head.value), examined + more
         worse = fresh(heads)
         if worse:
             break
     if tell is not None:
-        tell(f"{of_a_bound(heads[0].value)} at most on {looked} plants")
+        tell(f"{of_a_bound(heads[0].value)} at most on {examined} plants")
     return heads[0], worse
 
 

@@ -344,7 +344,7 @@ def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
 
 
 @pytest.mark.parametrize(
-    ("uses", "told"),
+    ("uses", "reported"),
     [
         ("", True),
         ("|{'hardware_cost': t['foo']}", False),

@@ -50,13 +50,13 @@ def test_the_way_to_one_optimum_is_no_look_at_the_rest_of_the_box() -> None:
         return Place(np.array(end.theta), objective_of(case, end), True)
 
     path = [sample(lower + share * low * (upper - lower)) for share in np.linspace(0.0, 1.0, 9)]
-    global_check = looked(case, path, sample, local_solve)
+    global_check = examined(case, path, sample, local_solve)
     assert global_check.moved
     assert global_check.x == pytest.approx(lower + high * (upper - lower))
     assert global_check.points <= len(path) + 8
 
 
-def looked(
+def examined(
     case: CoDesignProblem, path: list, sample: Callable, local_solve: Callable
 ) -> GlobalCheck:
     """A check from the end of a path, where each point is dear."""
@@ -88,5 +88,5 @@ def test_an_end_of_a_range_that_is_little_worse_leads_on(worse: float) -> None:
     def local_solve(start: InnerSample, _: object) -> None:
         started.append(max(np.subtract(start.theta, lower) / (upper - lower)))
 
-    looked(case, [sample(lower)], sample, local_solve)
+    examined(case, [sample(lower)], sample, local_solve)
     assert (1.0 in started) == (worse < 0.03)

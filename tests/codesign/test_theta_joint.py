@@ -76,7 +76,7 @@ def curved(system: Mechanics, middle: tuple[float, ...]) -> Evaluate:
     return at
 
 
-@pytest.mark.parametrize(("direction", "bent"), [(0, False), (1, False), (2, False), (3, True)])
+@pytest.mark.parametrize(("direction", "bending"), [(0, False), (1, False), (2, False), (3, True)])
 def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     direction: int, bending: bool
 ) -> None:

@@ -47,7 +47,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
             races.append(arguments)
             return honest(*arguments, **more)  # type: ignore[operator]
 
-        monkeypatch.setattr(module, "race", counted)
+        monkeypatch.setattr(module, "search_starts", counted)
     case = listed(w2=w2)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(case, store, pool)

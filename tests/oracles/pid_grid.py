@@ -65,7 +65,7 @@ def refined(loop: Loop, options: GridOptions = GridOptions()) -> tuple[float, np
     gains = np.clip(np.linspace(high[0] - np.log(1e3), high[0], o.gains) - size, low[0], high[0])
     # Between the points of a grid bounds are passed by little: these too are worth refining.
     value = table.bandwidths(shapes, gains, slack=0.15)
-    looked = value.size
+    examined = value.size
     starts: list[np.ndarray] = []
     for flat in np.argsort(-value, axis=None):
         row, j = np.unravel_index(flat, value.shape)
@@ -92,7 +92,7 @@ def refined(loop: Loop, options: GridOptions = GridOptions()) -> tuple[float, np
             local = np.clip(kappa[:, :1] + np.linspace(-wide, wide, o.local_gains), low[0], high[0])
             slack = 0.15 * 0.6**turn if turn < o.slack else 0.0
             value = fine.bandwidths(kappa, local, slack)
-            looked += value.size
+            examined += value.size
             top = np.argmax(value, axis=1)
             kappa[:, 0] = local[np.arange(len(kappa)), top]
             value = value[np.arange(len(kappa)), top]
@@ -112,7 +112,7 @@ def refined(loop: Loop, options: GridOptions = GridOptions()) -> tuple[float, np
             cov = 1.5 * spread.T @ spread / len(chosen) + 1e-14 * np.eye(5)
         if own > best:
             best, where = own, at
-    return best, where, looked
+    return best, where, examined
 
 
 def example(name: str, function: str) -> Callable[..., Any]:
@@ -210,11 +210,11 @@ def compared(case: Case, seed: int) -> dict[str, Any]:
     loop = loop_of(system, suspension, case.shifts, case.bounds,
                    case.expected_hz * HZ, made.frequencies[0])  # fmt: skip
     started = time.process_time()
-    _, kappa, looked = refined(loop)
+    _, kappa, examined = refined(loop)
     grid, over = judged(loop, kappa)
     row: dict[str, Any] = {
         "grid_hz": grid / HZ, "grid_over_bound": over, "grid_kappa": np.exp(kappa).tolist(),
-        "controllers": looked, "grid_seconds": time.process_time() - started,
+        "controllers": examined, "grid_seconds": time.process_time() - started,
         "outcome": made.outcome.value, "search_seconds": spent,
     }  # fmt: skip
     if made.certified:

@@ -210,13 +210,13 @@ def climbed(required: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     first = at_its_bandwidth(problem, starts[0], within=DesignOptions.margin)
     end = ascend(problem, first, iterations=CLIMB)
     point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
-    looked = end.evaluations
+    examined = end.evaluations
     if point.assessment.violation > DesignOptions.margin:
         end = ascend(problem, point, iterations=RESTORED, restoring=True, radius=0.05)
         point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
-        looked += end.evaluations
+        examined += end.evaluations
     search = DesignSearch(problem, plants, required.sampling, seed=seed)
-    return required, search.designed(point, (), 1, looked)
+    return required, search.designed(point, (), 1, examined)
 
 
 def proved(required: Case, design: SectionsDesign) -> Proof:

@@ -282,9 +282,9 @@ def test_the_box_holds_the_plants_that_it_names() -> None:
 def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     box = uncertain(resonance_shift=0.02, gain=0.03)
     required = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
-    heads, looked = worst_plants(required, count=40)
+    heads, examined = worst_plants(required, count=40)
     values = required.excesses(lattice(box, 60, 7))
-    assert looked > 40
+    assert examined > 40
     assert heads[0].value >= values.max() - 1e-6
     assert heads[0].value == pytest.approx(
         required.excesses([(heads[0].option, heads[0].point)])[0]
@@ -325,11 +325,11 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(S_low: float) -> None:
     kappa = SMALL.in_units(kappa, units.omega_0, units.force)
     required = LoopOnBox(box, SMALL, kappa, 0.01 * units.omega_0, EASY)
     masked = replace(required, bounds=replace(EASY, S_low=S_low))
-    heads, looked = worst_plants(masked, count=12)
+    heads, examined = worst_plants(masked, count=12)
     ends = np.array(list(np.ndindex(*(2,) * 7)))
     corners = [(0, box.box[row, np.arange(7)]) for row in ends]
     values = required.excesses([*lattice(box, 12, 0), *corners])
-    assert looked < len(corners)
+    assert examined < len(corners)
     found = required.excesses([(head.option, head.point) for head in heads])
     assert found.max() >= values.max() - 1e-6
 

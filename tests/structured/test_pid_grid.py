@@ -25,9 +25,9 @@ def test_no_point_of_a_grid_is_better_than_the_search() -> None:
     own, over = pid_grid.judged(loop, made.kappa)
     assert over <= 1.0 + 1e-4
     assert own == pytest.approx(made.bandwidth, rel=1e-3)
-    _, kappa, looked = pid_grid.refined(loop, SMALL)
+    _, kappa, examined = pid_grid.refined(loop, SMALL)
     grid, over = pid_grid.judged(loop, kappa)
-    assert looked > 10_000
+    assert examined > 10_000
     assert over < 1.01
     assert grid > 0.9 * made.bandwidth  # a grid that finds nothing shows nothing
     assert made.bandwidth >= grid * (1.0 - 5e-3 - (over - 1.0))
