@@ -243,6 +243,12 @@ class DriveTable:
         "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file like theirs (.toml)", None
     )
     velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
+    position_rate_hz: float | None = key(
+        "rate of the position loop, a whole part of loop.rate_hz; absent: that rate",
+        None,
+        unit="Hz",
+        check=checks.number(0.0, 1e9, "give more than 0"),
+    )
     filters: int = key("filters of the current command in use", 3, check=checks.count(0))
     setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
     filter_gain: float = key(

@@ -29,8 +29,8 @@ def cascade(name: str) -> Cascade:
     return Cascade(drive, 1.0 / RATE, slots, 1, 0, 2)
 
 
-def program(name: str) -> Program:
-    own = cascade(name)
+def program(name: str, slower: int = 1) -> Program:
+    own = replace(cascade(name), slower=slower)
     return program_of(own, np.array([*GAINS, *np.ravel(FILTERS)]))
 
 
@@ -41,7 +41,7 @@ def signals(count: int = 600) -> np.ndarray:
     return moved
 
 
-def simulated(name: str) -> list:
+def simulated(name: str, slower: int = 1) -> list:
     number = read_drive(name).number
     count = len(cascade(name).slots), len(read_drive(name).places("setpoint")[:1])
     real = np.float32 if number is Number.SINGLE else float
@@ -54,12 +54,13 @@ def simulated(name: str) -> list:
         else:
             made.append(oracle.float_filter([real(float(x)) for x in c]))
     split = count[0] - count[1]
-    return oracle.force(GAINS, made[split:], made[:split], RATE, real, signals())
+    return oracle.force(GAINS, made[split:], made[:split], RATE, real, signals(), slower)
 
 
+@pytest.mark.parametrize("slower", [1, 4])
 @pytest.mark.parametrize("name", ["sinamics_s120", "beckhoff_ax5000"])
-def test_it_is_the_simulation_to_the_bit(name: str) -> None:
-    assert program(name).run(*signals().T) == simulated(name)
+def test_it_is_the_simulation_to_the_bit(name: str, slower: int) -> None:
+    assert program(name, slower).run(*signals().T) == simulated(name, slower)
 
 
 def test_in_double_precision_it_is_the_simulation() -> None:
@@ -84,9 +85,11 @@ def test_coefficients_one_step_off_are_caught() -> None:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-@pytest.mark.parametrize("name", ["generic", "sinamics_s120", "beckhoff_ax5000"])
-def test_the_C_code_is_the_program_to_the_bit(name: str, tmp_path: Path) -> None:
-    own = program(name)
+@pytest.mark.parametrize(
+    ("name", "slower"), [("generic", 3), ("sinamics_s120", 1), ("beckhoff_ax5000", 8)]
+)
+def test_the_C_code_is_the_program_to_the_bit(name: str, slower: int, tmp_path: Path) -> None:
+    own = program(name, slower)
     (tmp_path / "cascade.c").write_text(own.code("a test"), "utf-8")
     library = tmp_path / "cascade.so"
     words = "cc -std=c99 -O2 -ffp-contract=off -Wall -Wextra -Werror -shared -fPIC -o"

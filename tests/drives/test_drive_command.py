@@ -29,6 +29,7 @@ def changed(**tables: dict[str, Any]) -> dict[str, Any]:
         ({"drive": {"name": "pi_e727"}}, "its PID is not designed"),
         ({"drive": {"filters": 5}}, "has 4 filters of the current"),
         ({"drive": {"velocity": "spindle"}}, "one of motor, load"),
+        ({"drive": {"position_rate_hz": 3000.0}}, "no whole part of loop.rate_hz"),
         ({"controller": {"compliance_max": 1e-5}}, "compliance_max"),
     ],
 )

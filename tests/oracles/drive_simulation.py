@@ -64,26 +64,41 @@ def float_filter(c: Sequence[Any]) -> Callable[[Any], Any]:
     return step
 
 
-def force(
+def controller(
     gains: tuple[float, float, float], setpoint: list[Callable[[Any], Any]],
     current: list[Callable[[Any], Any]], rate_hz: float, real: Callable[[Any], Any],
-    signals: np.ndarray,
-) -> list[Any]:  # fmt: skip
-    """u of rows (reference, position, motor): Kv in 1/s, Kp, Tn in s."""
+    slower: int = 1,
+) -> Callable[[float, float, float], Any]:  # fmt: skip
+    """u of (reference, position, motor), call after call: Kv in 1/s, Kp, Tn in s."""
     Kv, Kp, Tn = gains
     share, rate = real(1.0 / rate_hz / Tn), real(rate_hz)
-    integral, before, found = real(0.0), None, []
-    for reference, position, motor in signals.tolist():
-        wanted = real(Kv) * (real(reference) - real(position))
+    s: dict[str, Any] = {"integral": real(0.0), "before": None, "call": 0}
+
+    def step(reference: float, position: float, motor: float) -> Any:
+        if s["call"] % slower == 0:
+            s["read"] = real(Kv) * (real(reference) - real(position))
+        s["call"] += 1
+        wanted = s["read"]
         for one in setpoint:
             wanted = one(wanted)
         here = real(motor)
-        speed = (here - (here if before is None else before)) * rate
-        before = here
+        speed = (here - (here if s["before"] is None else s["before"])) * rate
+        s["before"] = here
         error = wanted - speed
-        integral = integral + share * error
-        u = real(Kp) * (error + integral)
+        s["integral"] = s["integral"] + share * error
+        u = real(Kp) * (error + s["integral"])
         for one in current:
             u = one(u)
-        found.append(u)
-    return found
+        return u
+
+    return step
+
+
+def force(
+    gains: tuple[float, float, float], setpoint: list[Callable[[Any], Any]],
+    current: list[Callable[[Any], Any]], rate_hz: float, real: Callable[[Any], Any],
+    signals: np.ndarray, slower: int = 1,
+) -> list[Any]:  # fmt: skip
+    """u of rows (reference, position, motor)."""
+    step = controller(gains, setpoint, current, rate_hz, real, slower)
+    return [step(*row) for row in signals.tolist()]

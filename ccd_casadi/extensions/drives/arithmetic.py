@@ -45,6 +45,8 @@ class Program:
     setpoint, current : tuple of (b0, b1, b2, a1, a2)
         Filters; integers where the drive has fixed point.
     options : ArithmeticOptions
+    slower : int
+        Calls to one of the position loop.
     """
 
     kind: Number
@@ -56,15 +58,18 @@ class Program:
     setpoint: tuple[tuple[Any, ...], ...]
     current: tuple[tuple[Any, ...], ...]
     options: ArithmeticOptions
+    slower: int = 1
 
     def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
         """Force at every instant, of the reference and both sensors in m as the drive has them."""
         real = self.real
         states = {id(own): [0, 0, 0, 0] if self._fixed else [real(0)] * 4
                   for own in (*self.setpoint, *self.current)}  # fmt: skip
-        last, total, found = real(motor[0]), real(0), []
-        for r, y, m in zip(reference, position, motor, strict=True):
-            v = real(self.Kv) * (real(r) - real(y))
+        last, total, held, found = real(motor[0]), real(0), real(0), []
+        for k, (r, y, m) in enumerate(zip(reference, position, motor, strict=True)):
+            if k % self.slower == 0:
+                held = real(self.Kv) * (real(r) - real(y))
+            v = held
             for own in self.setpoint:
                 v = self._filtered(own, states[id(own)], v)
             w = v - (real(m) - last) * real(self.rate)
@@ -75,6 +80,10 @@ class Program:
                 u = self._filtered(own, states[id(own)], u)
             found.append(u)
         return found
+
+    @property
+    def _often(self) -> str:
+        return "" if self.slower == 1 else f"; the position is read at every {self.slower}th call"
 
     @property
     def _fixed(self) -> bool:
@@ -105,7 +114,8 @@ class Program:
         inside = ("x = llrint(u / GRAIN)", f"y >>= {self.options.bits}", "(real)(y * GRAIN)") \
             if self._fixed else ("x = u", "", "y")  # fmt: skip
         gains = [f"{float(g)!r}{suffix}" for g in (self.Kv, self.Kp, self.share, self.rate)]
-        return f"""/* {title}: position, velocity and filters of a drive, one call each period.
+        return f"""/* {title}: position, velocity and filters of a drive,
+   one call each period{self._often}.
    cc -std=c99 -O2 -ffp-contract=off; right shifts of negative integers are arithmetic. */
 #include <math.h>
 #include <stdint.h>
@@ -114,7 +124,11 @@ class Program:
 #define GRAIN {self.options.grain!r}
 typedef {real} real;
 typedef {number} number;
-typedef struct {{ real last, total; int begun; number old[{max(count, 1)}][4]; }} cascade_state;
+typedef struct {{
+    real last, total, held;
+    int begun, call;
+    number old[{max(count, 1)}][4];
+}} cascade_state;
 
 static const number FILTERS[{max(count, 1)}][5] = {{
 {("," + chr(10)).join(rows) or "    {0}"}
@@ -134,8 +148,11 @@ void cascade_reset(cascade_state *s) {{ memset(s, 0, sizeof *s); }}
 /* r, y: setpoint and sensor of the position, m: the motor's sensor, m; the force, N. */
 real cascade_step(cascade_state *s, real r, real y, real m)
 {{
-    real v = {gains[0]} * (r - y), w, u;
+    real v, w, u;
     int i;
+    if (s->call == 0) s->held = {gains[0]} * (r - y);
+    s->call = (s->call + 1) % {self.slower};
+    v = s->held;
     if (!s->begun) {{ s->last = m; s->begun = 1; }}
     for (i = 0; i < {n}; i++) v = filtered(FILTERS[i], s->old[i], v);
     w = v - (m - s->last) * {gains[3]};
@@ -177,4 +194,5 @@ def program_of(
     Kv, Kp, Tn = (float(value) for value in values[:3])
     share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
     return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
-                   tuple(own["setpoint"]), tuple(own["current"]), options)  # fmt: skip
+                   tuple(own["setpoint"]), tuple(own["current"]), options,
+                   cascade.slower)  # fmt: skip

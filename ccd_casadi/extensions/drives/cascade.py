@@ -48,6 +48,8 @@ class Cascade:
     filter_gain : float
         What all filters on a sensor's way may raise at any frequency, relative to their gain at
         rest: without a limit they become leads that amplify noise.
+    slower : int
+        N: the position's error is read at every N-th instant, and held between (`two_rates`).
     """
 
     drive: Drive
@@ -57,6 +59,7 @@ class Cascade:
     velocity: int
     sensors: int
     filter_gain: float = np.inf
+    slower: int = 1
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:
@@ -90,11 +93,16 @@ class Cascade:
         return found
 
     def responses(self, values: Values, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """K (p, k) before coefficients are rounded, and ∂K/∂ln values (n, p, k)."""
+        """K (p, k) before coefficients are rounded, and ∂K/∂ln values (n, p, k).
+
+        Of a slower position loop the part that has the frequency of e: the hold over N instants
+        is 1/N (1 - z⁻ᴺ)/(1 - 1/z).
+        """
         Kv, Kp, Tn = (float(value) for value in values[:3])
         away, n = 1.0 - 1.0 / z, len(self.settings)
         lag = self.period / Tn / away
         base = Kp * (1.0 + lag)
+        held = np.mean([z**-i for i in range(self.slower)], axis=0)
         slopes = np.zeros((2, n, len(z)), complex)  # of ln of the motor's path, and the position's
         slopes[1, 0] = slopes[:, 1] = 1.0
         slopes[:, 2] = -lag / (1.0 + lag)
@@ -110,8 +118,8 @@ class Cascade:
             at += len(steep)
         K, dK = np.zeros((self.sensors, len(z)), complex), np.zeros((n, self.sensors, len(z)),
                                                                     complex)  # fmt: skip
-        for sensor, path, steep in ((self.velocity, base * away / self.period, slopes[0]),
-                                    (self.position, base * ahead * Kv, slopes[1])):  # fmt: skip
+        paths = base * away / self.period, base * ahead * Kv * held
+        for sensor, path, steep in zip((self.velocity, self.position), paths, slopes, strict=True):
             K[sensor] += path
             dK[:, sensor] += path * steep
         return K, dK
@@ -146,7 +154,8 @@ class Cascade:
         )
 
     def state_space(self, values: Values) -> StateSpace:
-        """K(z), errors of all sensors in, force out, coefficients as the drive rounds them."""
+        """K(z), errors of all sensors in, force out, coefficients as the drive rounds
+        them; of a slower position loop e as it is held."""
         Kv, Kp, Tn = (float(value) for value in values[:3])
         T = self.period
         blocks = {"current": [], "setpoint": []}  # type: dict[str, list[StateSpace]]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.forms import Filter, Number
+from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
@@ -59,6 +60,8 @@ class SearchOptions:
     least_damping, most_damping : float, float
         Of a filter's denominator, below which a filter is a needle; of all, above which it is two
         of first order far apart.
+    stable : float
+        By which a pole's modulus is below 1.
     """
 
     starts: int = 24
@@ -90,6 +93,7 @@ class SearchOptions:
     difference: float = 1e-5
     least_damping: float = 0.1
     most_damping: float = 2.0
+    stable: float = 1e-9
 
 
 class CascadeRows:
@@ -142,10 +146,13 @@ class CascadeRows:
 
     def stable(self, values: Array) -> bool:
         """Whether every plant's loop is."""
+        if self.cascade.slower > 1:
+            loops = (lift(self.cascade, values, G) for G in self.systems)
+            return all(loop.radius < 1.0 - self.options.stable for loop in loops)
         K = self.cascade.state_space(values)
         for G in self.systems:
             A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-            if not np.abs(np.linalg.eigvals(A)).max() < 1.0 - 1e-9:
+            if not np.abs(np.linalg.eigvals(A)).max() < 1.0 - self.options.stable:
                 return False
         return True
 

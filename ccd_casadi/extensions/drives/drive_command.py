@@ -27,7 +27,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.drives.arithmetic import program_of
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.of_case import drive_problem
-    from ccd_casadi.extensions.drives.sheet import entry, sheet_text
+    from ccd_casadi.extensions.drives.sheet import entry, proof_words, sheet_text
     from ccd_casadi.reporting.facts import run_name
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.json_files import write_json
@@ -59,7 +59,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform(f"sheet         {folder / 'sheet.txt'}")
     if found.status == "verified":
         return ExitCode.DONE
-    reason = found.proof.words if found.certificate.passed else found.certificate.words
+    reason = proof_words(found) if found.certificate.passed else found.certificate.words
     if found.rise > found.cascade.filter_gain:
         reason = f"filters raise their gain to {found.rise:.4g}, above filter_gain"
     say(one_line(f"not verified: {reason}"), sys.stderr)

@@ -1,6 +1,6 @@
 """A drive's cascade on a set of plants: searched, rounded, judged and proven."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
 from ccd_casadi.extensions.drives.cascade_search import Candidate, Search
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.rounding import RoundingOptions, on_the_grid
+from ccd_casadi.extensions.drives.two_rates import judge_two_rates
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
@@ -21,6 +22,9 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, counted
 
+_NONE = ("no cascade of this drive meets the bounds from any start; raise S_max or S_low, or give "
+         "it more filters")  # fmt: skip
+
 
 @dataclass(frozen=True)
 class DriveOptions:
@@ -30,6 +34,8 @@ class DriveOptions:
     ----------
     draws : int
         Plants that are drawn for the judge besides the corners.
+    draws_unproven : int
+        The same of two rates, of which there is no proof.
     rounds : int
         Of search and proof: a plant that the proof finds is added.
     rise_points : int
@@ -41,6 +47,7 @@ class DriveOptions:
 
     draws: int = 24
     rounds: int = 3
+    draws_unproven: int = 200
     lowered: int = 10
     lower: float = 1e-3
     rise_points: int = 20_000
@@ -63,8 +70,8 @@ class DriveDesign:
         Before rounding.
     certificate : SetCertificate
         Of the rounded controller, on corners, draws and what the proof found.
-    proof : Proof
-        Of the rounded controller.
+    proof : Proof or None
+        Of the rounded controller; None of two rates.
     """
 
     cascade: Cascade
@@ -72,13 +79,14 @@ class DriveDesign:
     bandwidth: float
     free: Candidate
     certificate: SetCertificate
-    proof: Proof
+    proof: Proof | None
 
     @property
     def status(self) -> str:
-        """verified: the judge passes it, and it is proven on the whole set."""
-        whole = self.certificate.passed and self.proof.proven
-        whole = whole and self.rise <= self.cascade.filter_gain
+        """verified: the judge passes it, and it is proven on the whole set, or judged on all of it
+        where the set is one plant."""
+        proven = len(self.certificate.plants) == 1 if self.proof is None else self.proof.proven
+        whole = self.certificate.passed and proven and self.rise <= self.cascade.filter_gain
         return "verified" if whole else "not_verified"
 
     @property
@@ -120,13 +128,14 @@ def design_drive(
         No start is stable within the drive's limits, or none meets the bounds.
     """
     require_known(bounds)
+    if cascade.slower > 1:
+        return _design_two_rates(cascade, uncertain, bounds, sampling, seed, progress, options)
     points = _first(uncertain)
     progress(f"searching {options.search.starts} starts on {counted(len(points), 'plant')}")
     search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
     free = search.fastest(seed, progress)
     if free is None:
-        words = "no cascade of this drive meets the bounds from any start"
-        raise UserError(f"{words}; raise S_max or S_low, or give it more filters")
+        raise UserError(_NONE)
     for number in range(1, options.rounds + 1):
         progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
         rounded = on_the_grid(search, free, options.rounding)
@@ -147,6 +156,49 @@ def design_drive(
         free = search.settled(free)
     cascade.require_fit(rounded.values)
     return DriveDesign(cascade, rounded.values, band, free, judged, proof)
+
+
+def _design_two_rates(
+    cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, seed: int,
+    progress: Tell, options: DriveOptions,
+) -> DriveDesign:  # fmt: skip
+    """Search with the part of a held error that has its frequency, judge by lifting; where that
+    exceeds a bound, again with bounds that are tighter by as much."""
+    points = _first(uncertain)
+    drawn = []
+    if len(points) > 1:
+        drawn = uncertain.drawn(np.random.default_rng([seed, options.draws]),
+                                options.draws_unproven)  # fmt: skip
+    plants = _plants(uncertain, [*points, *drawn])
+    own = bounds
+    for number in range(1, options.rounds + 1):
+        progress(f"searching {options.search.starts} starts, round {number} of {options.rounds}")
+        search = Search(cascade, own, sampling, plants[: len(points)], options.search)
+        free = search.fastest(seed, progress)
+        if free is None:
+            raise UserError(_NONE)
+        rounded = on_the_grid(search, free, options.rounding)
+        judged = judge_two_rates(cascade, rounded.values, plants, bounds, sampling)
+        progress(f"{judged.bandwidth / HZ:.4g} Hz on the drive's grid; {judged.words}")
+        if judged.passed:
+            break
+        peak = max((s for name, s in judged.worst.items() if name != "S_LOW"), default=1.1)
+        low = max(1.0, judged.worst.get("S_LOW", 1.1))
+        own = _tighter(own, max(1.0, peak) * (1.0 + options.lower), low * (1.0 + options.lower))
+    assert free is not None
+    cascade.require_fit(rounded.values)
+    return DriveDesign(cascade, rounded.values, judged.bandwidth, free, judged, None)
+
+
+def _tighter(bounds: Bounds, peak: float, low: float) -> Bounds:
+    """The bounds with |S| - 1 and S_low divided by these."""
+
+    def less(S_max: float) -> float:
+        return 1.0 + (S_max / peak - 1.0 if S_max > peak else 0.5 * (S_max - 1.0))
+
+    channels = tuple(replace(one, S_max=None if one.S_max is None else less(one.S_max))
+                     for one in bounds.channels)  # fmt: skip
+    return replace(bounds, S_max=less(bounds.S_max), S_low=bounds.S_low / low, channels=channels)
 
 
 def judge(

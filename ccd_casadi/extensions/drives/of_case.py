@@ -74,13 +74,25 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             filters += there[:count]
         position, velocity, count = _sensors(bounds, table.velocity)
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
-                          table.filter_gain)  # fmt: skip
+                          table.filter_gain, _slower(table, problem.sampling))  # fmt: skip
         uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
     except CaseError:
         raise
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
     return DriveProblem(cascade, uncertain, bounds, problem.sampling)
+
+
+def _slower(table: DriveTable, sampling: Sampling) -> int:
+    """Instants of the loop's rate to one of the position's."""
+    if table.position_rate_hz is None:
+        return 1
+    ratio = sampling.rate_hz / table.position_rate_hz
+    slower = round(ratio)
+    if slower < 1 or abs(ratio - slower) > 1e-9 * ratio:
+        words = f"position_rate_hz is {table.position_rate_hz:g}, no whole part of loop.rate_hz"
+        raise UserError(f"{words}; give {sampling.rate_hz:g} over 1, 2, 3, ...")
+    return slower
 
 
 def _sensors(bounds: Bounds, velocity: str | None) -> tuple[int, int, int]:

@@ -29,13 +29,24 @@ def entry(design: DriveDesign) -> dict[str, Any]:
         "filter_gain": design.rise,
         "judge": {"passed": judged.passed, "words": judged.words, "plants": len(judged.plants),
                   "shares": bounds},
-        "proof": {"proven": design.proof.proven, "words": design.proof.words,
-                  "levels": design.proof.levels, "slack": design.proof.slack},
+        "position_rate_hz": 1.0 / (design.cascade.period * design.cascade.slower),
+        "proof": None if design.proof is None else {
+            "proven": design.proof.proven, "words": design.proof.words,
+            "levels": design.proof.levels, "slack": design.proof.slack},
         "parameters": sheet_rows(design),
         "sources": list(drive.sources),
         "chosen": list(drive.chosen),
         "unknown": list(drive.unknown),
     }  # fmt: skip
+
+
+def proof_words(design: DriveDesign) -> str:
+    """What is proven, in a sentence."""
+    if design.proof is not None:
+        return design.proof.words
+    if len(design.certificate.plants) == 1:
+        return "not needed: the set is one plant"
+    return "there is none of two rates; between the judged plants nothing is proven"
 
 
 def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) -> str:
@@ -56,7 +67,7 @@ def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) ->
     rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
     found.append(f"bandwidth     {rounded:.4g} Hz; {free:.4g} Hz before rounding, on fewer plants")
     found.append(f"judged        {design.certificate.words}")
-    found.append(f"proof         {design.proof.words}")
+    found.append(f"proof         {proof_words(design)}")
     limit = design.cascade.filter_gain
     found.append(f"filters       raise their gain to {design.rise:.4g} of rest; limit {limit:.4g}")
     found += [f"chosen        {words}" for words in drive.chosen]
