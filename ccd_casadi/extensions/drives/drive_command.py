@@ -3,6 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, one_line, option, valued
@@ -14,6 +15,7 @@ from ccd_casadi.support.terminal import inform, remark, say
     "Find the fastest cascade of the drive that [drive] names, round it as the drive rounds, judge "
     "and prove it; write a sheet of its parameters, JSON and C code.",
     option("--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"),
+    option("--codesign", action="store_true", help="search theta as well, by the case's objective"),
     option("--today", metavar="FILE.toml", type=Path,
            help="present values by number or name, shown beside the new ones"),
     valued("--starts", "N", integer(1), "starting points of the search", 24),
@@ -25,9 +27,17 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     from ccd_casadi.cases.case import load_case, parse_theta, read_toml
     from ccd_casadi.extensions.drives.arithmetic import program_of
+    from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.of_case import drive_problem
-    from ccd_casadi.extensions.drives.sheet import entry, proof_words, sheet_text
+    from ccd_casadi.extensions.drives.sheet import (
+        codesign_words,
+        entry,
+        figures_of,
+        named_theta,
+        proof_words,
+        sheet_text,
+    )
     from ccd_casadi.reporting.facts import run_name
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.json_files import write_json
@@ -39,22 +49,36 @@ def main(options: argparse.Namespace) -> ExitCode:
     today = None if options.today is None else read_toml(options.today)
     if today and not all(isinstance(value, (int, float)) for value in today.values()):
         raise UserError(f'{options.today}: give numbers, as in "p1417" = 500')
+    if theta is not None and options.codesign:
+        raise UserError("--theta fixes what --codesign searches; give one of both")
     problem = drive_problem(case, theta)
     folder = run_folder(options.case, options.out)
-    search = replace(DriveOptions().search, starts=options.starts)
+    numbers = DriveOptions(search=replace(DriveOptions().search, starts=options.starts))
+    near = None
+    searched: dict[str, Any] = {}
+    if options.codesign:
+        first, best = codesign_drive(
+            problem, options.seed, lambda words: remark(words, options.quiet),
+            DriveCodesignOptions(drive=numbers),
+        )  # fmt: skip
+        problem, near = drive_problem(case, best.theta), best.candidate
+        searched = {"theta": named_theta(problem, best), "codesign": {
+            "start": figures_of(problem, first), "best": figures_of(problem, best)}}  # fmt: skip
     with Workers(options.workers) as workers:
         found = design_drive(
             problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
-            seed=options.seed, workers=workers, options=DriveOptions(search=search),
+            seed=options.seed, workers=workers, options=numbers, near=near,
             progress=lambda words: remark(words, options.quiet),
         )  # fmt: skip
     text = sheet_text(found, today)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
     code = program_of(found.cascade, found.values).code(run_name(folder))
     (folder / "cascade.c").write_text(code, "utf-8")
-    answer = entry(found) | {"seconds": options.seconds(), "seed": options.seed,
+    answer = entry(found) | searched | {"seconds": options.seconds(), "seed": options.seed,
                              "versions": versions()}  # fmt: skip
     write_json(folder / "drive.json", answer)
+    if searched:
+        text = f"{codesign_words(searched['codesign'])}\n{text}"
     inform(text)
     inform(f"sheet         {folder / 'sheet.txt'}")
     if found.status == "verified":

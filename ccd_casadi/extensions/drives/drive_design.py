@@ -22,8 +22,10 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, counted
 
-_NONE = ("no cascade of this drive meets the bounds from any start; raise S_max or S_low, or give "
-         "it more filters")  # fmt: skip
+NO_CASCADE = (
+    "no cascade of this drive meets the bounds from any start; raise S_max or S_low, or give it "
+    "more filters"
+)
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class DriveDesign:
 def design_drive(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, *,
     seed: int = 0, workers: Pool | None = None, progress: Tell = silent,
-    options: DriveOptions = DriveOptions(),
+    options: DriveOptions = DriveOptions(), near: Candidate | None = None,
 ) -> DriveDesign:  # fmt: skip
     """Find the fastest rounded cascade.
 
@@ -117,6 +119,8 @@ def design_drive(
     progress : callable
         Takes a line at each step.
     options : DriveOptions
+    near : Candidate, optional
+        From which the search climbs, instead of many starts.
 
     Returns
     -------
@@ -129,13 +133,14 @@ def design_drive(
     """
     require_known(bounds)
     if cascade.slower > 1:
-        return _design_two_rates(cascade, uncertain, bounds, sampling, seed, progress, options)
-    points = _first(uncertain)
+        return _design_two_rates(cascade, uncertain, bounds, sampling, seed, progress, options,
+                                 near)  # fmt: skip
+    points = first_points(uncertain)
     progress(f"searching {options.search.starts} starts on {counted(len(points), 'plant')}")
-    search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
-    free = search.fastest(seed, progress)
+    search = Search(cascade, bounds, sampling, plants_at(uncertain, points), options.search)
+    free = search.fastest(seed, progress) if near is None else search.settled(near)
     if free is None:
-        raise UserError(_NONE)
+        raise UserError(NO_CASCADE)
     for number in range(1, options.rounds + 1):
         progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
         rounded = on_the_grid(search, free, options.rounding)
@@ -152,7 +157,7 @@ def design_drive(
         if not proof.refuted:
             break
         points = [*points, (proof.option, np.array(proof.point))]
-        search = Search(cascade, bounds, sampling, _plants(uncertain, points), options.search)
+        search = Search(cascade, bounds, sampling, plants_at(uncertain, points), options.search)
         free = search.settled(free)
     cascade.require_fit(rounded.values)
     return DriveDesign(cascade, rounded.values, band, free, judged, proof)
@@ -160,23 +165,23 @@ def design_drive(
 
 def _design_two_rates(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, seed: int,
-    progress: Tell, options: DriveOptions,
+    progress: Tell, options: DriveOptions, near: Candidate | None,
 ) -> DriveDesign:  # fmt: skip
     """Search with the part of a held error that has its frequency, judge by lifting; where that
     exceeds a bound, again with bounds that are tighter by as much."""
-    points = _first(uncertain)
+    points = first_points(uncertain)
     drawn = []
     if len(points) > 1:
         drawn = uncertain.drawn(np.random.default_rng([seed, options.draws]),
                                 options.draws_unproven)  # fmt: skip
-    plants = _plants(uncertain, [*points, *drawn])
+    plants = plants_at(uncertain, [*points, *drawn])
     own = bounds
     for number in range(1, options.rounds + 1):
         progress(f"searching {options.search.starts} starts, round {number} of {options.rounds}")
         search = Search(cascade, own, sampling, plants[: len(points)], options.search)
-        free = search.fastest(seed, progress)
+        free = search.fastest(seed, progress) if near is None else search.settled(near)
         if free is None:
-            raise UserError(_NONE)
+            raise UserError(NO_CASCADE)
         rounded = on_the_grid(search, free, options.rounding)
         judged = judge_two_rates(cascade, rounded.values, plants, bounds, sampling)
         progress(f"{judged.bandwidth / HZ:.4g} Hz on the drive's grid; {judged.words}")
@@ -219,8 +224,18 @@ def require_known(bounds: Bounds) -> None:
             raise UserError(f"{key} does not go with [drive] yet; leave it out")
 
 
-def _first(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
-    """The corners, and between the model and each of them half way."""
+def first_points(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+    """List the corners, and between the model and each of them half way.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+
+    Returns
+    -------
+    list of (int, array)
+        Options and points of the box.
+    """
     corners = uncertain.corners()
     middle = uncertain.nominal
     between = [(option, 0.5 * (point + middle)) for option, point in corners
@@ -228,5 +243,6 @@ def _first(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
     return [*corners, *between]
 
 
-def _plants(uncertain: UncertainPlant, points: list[tuple[int, Array]]) -> list[StateSpace]:
+def plants_at(uncertain: UncertainPlant, points: list[tuple[int, Array]]) -> list[StateSpace]:
+    """Make the plants at points of the box, continuous, SI."""
     return [uncertain.plant(point, option).plant_si() for option, point in points]

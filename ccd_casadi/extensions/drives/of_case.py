@@ -14,7 +14,7 @@ from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
 from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.problem import refuse_ports
+from ccd_casadi.inner_problem.problem import CoDesignProblem, refuse_ports
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
@@ -23,8 +23,9 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class DriveProblem:
-    """A cascade, the plants that it drives and what its loops have to keep."""
+    """A cascade, its plants at one θ of a co-design problem, and what its loops have to keep."""
 
+    problem: CoDesignProblem
     cascade: Cascade
     uncertain: UncertainPlant
     bounds: Bounds
@@ -80,7 +81,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         raise
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
-    return DriveProblem(cascade, uncertain, bounds, problem.sampling)
+    return DriveProblem(problem, cascade, uncertain, bounds, problem.sampling)
 
 
 def _slower(table: DriveTable, sampling: Sampling) -> int:

@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
-from ccd_casadi.support.text import HZ
+from ccd_casadi.extensions.drives.of_case import DriveProblem
+from ccd_casadi.support.text import HZ, number
 
 
 def sheet_rows(design: DriveDesign) -> list[dict[str, Any]]:
@@ -38,6 +40,27 @@ def entry(design: DriveDesign) -> dict[str, Any]:
         "chosen": list(drive.chosen),
         "unknown": list(drive.unknown),
     }  # fmt: skip
+
+
+def named_theta(problem: DriveProblem, at: DriveAt) -> dict[str, float]:
+    """θ by name, SI."""
+    return dict(zip(problem.problem.names, at.theta, strict=True))
+
+
+def figures_of(problem: DriveProblem, at: DriveAt) -> dict[str, Any]:
+    """What is known of a θ before rounding."""
+    return {"theta": named_theta(problem, at), "bandwidth_hz": at.candidate.bandwidth / HZ,
+            "hardware_cost": at.cost, "objective": at.objective}  # fmt: skip
+
+
+def codesign_words(entry: Mapping[str, Any]) -> str:
+    """Both designs of a co-design, a line each."""
+    return "\n".join(
+        f"{name:14s}J {number(one['objective'], 5)}, {number(one['bandwidth_hz'], 4)} Hz, cost "
+        f"{number(one['hardware_cost'], 4)} at "
+        + ", ".join(f"{key} = {number(value)}" for key, value in one["theta"].items())
+        for name, one in entry.items()
+    )
 
 
 def proof_words(design: DriveDesign) -> str:
