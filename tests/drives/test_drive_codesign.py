@@ -33,7 +33,7 @@ def problem(minimise: str = "") -> DriveProblem:
         data["plant"]["sensor"] = "load"
         del data["controller"]["bandwidth_of"], data["controller"]["channel"]
         del data["drive"]["velocity"]
-        data["budget"] = {"force": {"unit": "N2/Hz", "level": 1e-6}}
+        data["budget"] = {"force": {"unit": "N^2/Hz", "level": 1e-6}}
     return drive_problem(parse_case(data, EXAMPLE))
 
 
