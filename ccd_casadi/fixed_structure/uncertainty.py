@@ -21,7 +21,9 @@ import numpy as np
 from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.as_written import as_written
+from ccd_casadi.plants.first_order import FirstOrder
 from ccd_casadi.plants.modal import (
     FREE,
     ModalPlant,
@@ -80,7 +82,7 @@ class UncertainPlant:
     def modes(self) -> int:
         """The largest number of flexible modes of any option."""
         plants = [modal_plant(option, self._free) for option in self.options]
-        return max(int((~plant.rigid).sum()) for plant in plants)
+        return max(len(plant.numbered) for plant in plants)
 
     @property
     def _free(self) -> Suspension:
@@ -124,6 +126,10 @@ class UncertainPlant:
         """The scaled plant at a point of the box; its derivatives are those to θ."""
         modal, count = self._modal(point, option), len(self.ranges)
         if count:
+            if (states := modal.states) is not None:
+                own = Slopes(*(d[:-count] for d in states.slopes))
+                return scale_plant(replace(modal, states=replace(states, slopes=own)), self.M_K,
+                                   bare=True)  # fmt: skip
             modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
         return scale_plant(modal, self.M_K, bare=True)
 
@@ -136,6 +142,9 @@ class UncertainPlant:
         Those to parameters of the model are the model's own.
         """
         modal, values = self._modal(point, option), np.asarray(point, float)
+        if modal.states is not None:
+            return scale_plant(replace(modal, states=self._to_point(modal.states, values)),
+                               self.M_K, bare=True)  # fmt: skip
         flexible = np.flatnonzero(~modal.rigid)
         count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
         dM, dK, dD = np.zeros((3, count, n, n))
@@ -160,6 +169,27 @@ class UncertainPlant:
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
         return scale_plant(moved, self.M_K, bare=True)
 
+    def _to_point(self, states: FirstOrder, values: Array) -> FirstOrder:
+        """A plant of first order with derivatives to the point; see `sloped`."""
+        system, count = states.system, len(self.ranges)
+        rows = []
+        for name, value in zip(self.names, values.tolist(), strict=True):
+            if name.startswith("theta."):
+                continue
+            by_gain = (0.0 * system.A, system.B / (1.0 + value))
+            rows.append(by_gain if name == "gain" else states.to_point(name, value))
+        found = []
+        for own, part, given in zip(
+            zip(*rows, strict=True) if rows else ((), ()),
+            (system.A, system.B),
+            states.slopes,
+            strict=False,
+        ):
+            found.append(np.array([*own, *given[len(given) - count :]]).reshape(-1, *part.shape))
+        dC = np.zeros((len(self.names), *system.C.shape))
+        dC[len(self.names) - count :] = states.slopes.dC[len(states.slopes.dC) - count :]
+        return replace(states, slopes=Slopes(*found, dC))
+
     def _off(self, point: Array, option: int) -> tuple[dict[str, float], Mechanics, Perturbation]:
         """A point's values by name, the matrices of its option there, and how modes are off."""
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
@@ -177,9 +207,7 @@ class UncertainPlant:
         modal = modal_plant(system, self._free, off)
         modal = without_hidden_rigid_modes(modal)
         gain = 1.0 + values.get("gain", 0.0)
-        if gain != 1.0:
-            modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
-        return modal
+        return modal if gain == 1.0 else modal.driven(gain)
 
     def plants(self, points: Sequence[tuple[int, Array]]) -> list[ScaledPlant]:
         """The plants of (option, point) pairs."""
@@ -297,12 +325,14 @@ class ModalSum:
 def modal_sum(
     uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
 ) -> ModalSum | None:
-    """None where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
+    """None of a plant of first order, and where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
     brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
     damping ratio, one force, one sensor, a stiffness that holds them, and to be apart at the
     model."""
     system = uncertain.options[option]
     modal = uncertain.modal(option)
+    if modal.states is not None:
+        return None
     zeta = float(system.damping_ratio or 0.0)
     given, away = modal.D - np.diag(2.0 * zeta * modal.natural), modal.driven_away
     omega = np.where(away, np.sqrt(np.abs(np.diag(modal.K))), modal.natural)

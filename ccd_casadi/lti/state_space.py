@@ -167,14 +167,30 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     -------
     A, B, C : arrays of the same shapes
     """
+    t = state_scales(A, B, C)
+    parts = A * t / t[:, None], B / t[:, None], C * t
+    A, B, C = (np.ascontiguousarray(part) for part in parts)
+    return A, B, C
+
+
+def state_scales(A: Array, B: Array, C: Array) -> Array:
+    """Find the T of `balanced`.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+
+    Returns
+    -------
+    array (n,)
+        Powers of two.
+    """
     n, m, p = len(A), B.shape[1], C.shape[0]
     system = np.zeros((n + m + p, n + m + p))
     system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
     with np.errstate(invalid="ignore"):  # scales beyond 64 bits, as integers that nobody reads
-        even, _ = matrix_balance(system, permute=False)
-    parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
-    A, B, C = (np.ascontiguousarray(part) for part in parts)
-    return A, B, C
+        scales = matrix_balance(system, permute=False, separate=True)[1][0]
+    return np.asarray(scales[:n], float)
 
 
 def weighted(system: StateSpace, filters: Array) -> StateSpace:

@@ -171,11 +171,18 @@ def single_modes(run: FinishedRun, reach: float) -> tuple[PerturbedLoop, ...]:
     modal = run.modal()
     residue = np.linalg.norm(modal.B, axis=1) * np.linalg.norm(modal.C, axis=0)
     found = []
-    for i in np.flatnonzero(~modal.rigid & (residue > 1e-9 * residue.max())):
+    for i in np.sort(modal.numbered):
+        if not residue[i] > 1e-9 * residue.max():
+            continue
         for shift in (-reach, reach):
+            place = (float(modal.natural[i]) / (2.0 * np.pi), shift)
+            if modal.states is not None:
+                own = np.where(modal.numbered == i, shift, 0.0)
+                states = modal.states.off(0.0, 1.0, own.tolist())
+                found.append(judge(run, replace(modal, states=states), place))
+                continue
             K = modal.K.copy()
             K[i, i] *= (1.0 + shift) ** 2
-            place = (float(modal.natural[i]) / (2.0 * np.pi), shift)
             found.append(judge(run, replace(modal, K=K), place))
     return tuple(found)
 
