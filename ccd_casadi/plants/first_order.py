@@ -21,7 +21,6 @@ import scipy
 
 from ccd_casadi.lti.state_space import StateSpace, state_scales, strictly_proper
 from ccd_casadi.lti.wiring import Slopes
-from ccd_casadi.plants.rigid_modes import driven_and_measured
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -88,17 +87,27 @@ class FirstOrder:
         """The number of states of poles at 0."""
         return 2 * self.bodies + self.integrators
 
+    @property
+    def of_integrators(self) -> Array | None:
+        """The residue (p, m) of 1/s of single integrators; None where there are none."""
+        single = slice(2 * self.bodies, self.at_rest)
+        return self.system.C[:, single] @ self.system.B[single] if self.integrators else None
+
     def suspended(self, omega: float, damping_ratio: float) -> "FirstOrder":
-        """The same with what is free held by springs of ω in rad/s, integrators by a leak."""
+        """The same with free bodies held by springs of ω in rad/s, or integrators by a leak. Raises
+        PlantError where it has both, whose states at rest are not one alone."""
         n, r = self.bodies, self.at_rest
+        if n and self.integrators:
+            words = "mixed sensitivity cannot hold a free body and an integrator of one A"
+            raise PlantError(f'{words}; use controller.structure = "sections"')
         held = np.zeros_like(self.system.A)
         q, v, single = np.arange(n), np.arange(n, 2 * n), np.arange(2 * n, r)
-        held[v, q], held[v, v], held[single, single] = -(omega**2), -2.0 * damping_ratio * omega, -omega
-        T, back = self._basis
-        P = self._turning()
-        C = self.system.C @ T
-        moved = self.slopes.dC @ T[:, v] + C[:, r:] @ P[:, r:, v]  # sensors do not see velocities
-        P[:, :n, v] = -np.linalg.pinv(C[:, q]) @ moved
+        held[v, q], held[v, v] = -(omega**2), -2.0 * damping_ratio * omega
+        held[single, single] = -omega
+        (T, back), P, C = self._basis, self._turning(), self.system.C
+        E, read = self.slopes.dA, C[:, r:] @ self.V @ P[:, r:, v]
+        P[:, v[:, None], q], P[:, v[:, None], v] = -E[:, q[:, None], q], -E[:, q[:, None], v]
+        P[:, q[:, None], v] = -np.linalg.pinv(C[:, q]) @ (self.slopes.dC[:, :, v] + read)
         dA = self.slopes.dA + (T @ (P @ held - held @ P) @ back).real
         system = replace(self.system, A=self.system.A + held)
         return replace(self, system=system, slopes=self.slopes._replace(dA=dA))
@@ -177,7 +186,7 @@ class FirstOrder:
         """Free bodies, complex pairs and real poles as modes; single integrators are none.
 
         A pair's residue is N₁ s + N₀, of which N₀ is taken; a real pole p is s² + 2|p| s + p²,
-        an unstable one s² - p², with what it moves at rest.
+        an unstable one s² - p², with what it moves at rest. A mode is driven as much as measured.
         """
         n, r, lam = self.bodies, self.at_rest, self.rates
         B, C = self.W @ self.system.B[r:], self.system.C[:, r:] @ self.V
@@ -189,12 +198,17 @@ class FirstOrder:
         decay = np.where(np.abs(own.real) > options.on_axis * np.abs(own), -2.0 * own.real, 0.0)
         at_rest = -2.0 * (C[:, pairs] * (own.conj() / turned[pairs])).real
         sign = np.where(p < 0.0, -1.0, 1.0)
+        drive = np.vstack([self.system.B[n : 2 * n], (turned[:, None] * B)[pairs].real,
+                           np.abs(p)[:, None] * B[real].real])  # fmt: skip
+        reading = np.hstack([self.system.C[:, :n], at_rest, C[:, real].real])
+        sizes = np.linalg.norm(drive, axis=1), np.linalg.norm(reading, axis=0)
+        seen = (sizes[0] > 0.0) & (sizes[1] > 0.0)
+        even = np.sqrt(np.divide(sizes[0], sizes[1], out=np.ones(len(drive)), where=seen))
         return Modes(
             np.concatenate([np.zeros(n), np.abs(own) ** 2, -sign * p**2]),
             np.concatenate([np.zeros(n), decay, np.where(p < 0.0, -2.0 * p, 0.0)]),
-            np.vstack([self.system.B[n : 2 * n], (turned[:, None] * B)[pairs].real,
-                       np.abs(p)[:, None] * B[real].real]),
-            np.hstack([self.system.C[:, :n], at_rest, C[:, real].real]),
+            drive / even[:, None],
+            reading * even,
             np.arange(n + len(pairs) + len(real)) < n,
             n + np.arange(len(pairs)),
         )  # fmt: skip
@@ -229,7 +243,7 @@ def first_order(
     slopes = Slopes(slopes.dA * t / t[:, None], slopes.dB / t[:, None], slopes.dC * t)
     T, back, n, k = _at_rest(A, C, options)
     r = 2 * n + k
-    _require_seen(back[:r] @ B, C @ T[:, :r], n, B, C)
+    _require_seen(back[n:r] @ B, C @ np.delete(T[:, :r], np.s_[n : 2 * n], axis=1), B, C)
     A, N = back @ A @ T, np.zeros((r, r))
     N[np.arange(n), np.arange(n, 2 * n)] = 1.0
     A[:r], A[:, :r], B, C = 0.0, 0.0, back @ B, C @ T
@@ -272,7 +286,7 @@ def _at_rest(A: Array, C: Array, options: FirstOrderOptions) -> tuple[Array, Arr
     single = np.flatnonzero(seen > 1e-9)
     q, v = right @ Qt[bodies].T, P[:, bodies].T @ left
     rates, places = np.linalg.lstsq(A, q)[0], np.linalg.lstsq(A.T, v.T)[0].T
-    rates -= q @ (np.linalg.pinv(C @ q) @ (C @ rates))  # sensors see positions, not velocities
+    rates -= q @ (np.linalg.pinv(C @ q) @ (C @ rates))  # sensors see positions, no velocities
     columns = np.hstack([q, rates, right @ Qt[single].T])
     rows = np.vstack([places, v, P[:, single].T @ left])
     pairing = rows @ columns
@@ -287,12 +301,14 @@ def _at_rest(A: Array, C: Array, options: FirstOrderOptions) -> tuple[Array, Arr
     return T, np.linalg.inv(T), len(bodies), len(single)
 
 
-def _require_seen(drive: Array, reading: Array, bodies: int, B: Array, C: Array) -> None:
-    """Raise PlantError where a pole at 0 is not driven and measured."""
-    sizes = max(np.abs(B).max(), 1e-300), max(np.abs(C).max(), 1e-300)
-    of_bodies = slice(bodies, 2 * bodies), slice(0, bodies)
-    for own, seen in (of_bodies, (slice(2 * bodies, None), slice(2 * bodies, None))):
-        b, c = drive[own] / sizes[0], reading[:, seen] / sizes[1]
-        if len(b) and driven_and_measured(b, c)[0].shape[1] < len(b):
-            words = "a pole at 0 of A is neither driven nor measured"
-            raise PlantError(f"{words}; leave its states out of A")
+def _require_seen(
+    drive: Array, reading: Array, B: Array, C: Array, *, hidden: float = 1e-9
+) -> None:
+    """Raise PlantError unless all that A leaves at rest is driven and measured apart."""
+    words = "a pole at 0 of A is not {}: no controller holds it; {}, or leave its states out of A"
+    for gains, whole, what, remedy in (
+        (drive, B, "driven", "add an input that moves it"),
+        (reading, C, "measured", "add an output that sees it"),
+    ):
+        if np.linalg.matrix_rank(gains, hidden * np.abs(whole).max()) < len(drive):
+            raise PlantError(words.format(what, remedy))
