@@ -127,7 +127,8 @@ class UncertainPlant:
         modal, count = self._modal(point, option), len(self.ranges)
         if count:
             if (states := modal.states) is not None:
-                own = Slopes(*(d[:-count] for d in states.slopes))
+                dA, dB, dC = (d[:-count] for d in states.slopes)
+                own = Slopes(dA, dB, dC)
                 return scale_plant(replace(modal, states=replace(states, slopes=own)), self.M_K,
                                    bare=True)  # fmt: skip
             modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
@@ -325,8 +326,8 @@ class ModalSum:
 def modal_sum(
     uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
 ) -> ModalSum | None:
-    """None of a plant of first order, and where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
-    brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
+    """None of a plant of first order, and where a given damping matrix couples the modes (by more
+    than `uncoupled`, relative) or brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
     damping ratio, one force, one sensor, a stiffness that holds them, and to be apart at the
     model."""
     system = uncertain.options[option]

@@ -5,11 +5,13 @@ In `Mechanics` it has M = 0, D = 1 and K = -A. Its poles at 0 are parted from th
     T⁻¹ A T = diag(N, R),   N: q̇ = v, v̇ = 0 of free bodies, 0 of single integrators
 
 so that they stay at exactly 0, as the free bodies of mechanics do. Off the model every complex pair
-λ of R moves alone, with a common shift s, its own s_i and a factor d of the damping,
+λ of R of a damping ratio below 0.3 moves alone, with a common shift s, its own s_i and a factor d
+of the damping,
 
     λ' = (1 + s)(1 + s_i)(d Re λ + j Im λ),   residue' = residue/((1 + s)(1 + s_i)),
 
-so that what a force accelerates stays as it is. Real poles stay: a range of a parameter moves them.
+so that what a force accelerates stays as it is. All others stay: they are no resonances but coils
+and lags, which ranges of parameters move.
 """
 
 from collections.abc import Sequence
@@ -35,12 +37,15 @@ class FirstOrderOptions:
         Singular value of A, in even scales, below which it is 0.
     on_axis : float
         |Re λ|/|λ| up to which a complex pair is undamped, and |Im λ|/|λ| up to which it is real.
+    resonant : float
+        Damping ratio below which a complex pair is a resonance.
     defective : float
         Condition of the eigenvectors, in even scales, beyond which A is not diagonalisable.
     """
 
     at_rest: float = 1e-13
     on_axis: float = 1e-10
+    resonant: float = 0.3
     defective: float = 1e10
 
 
@@ -52,7 +57,7 @@ class Modes(NamedTuple):
     drive: Array
     reading: Array
     rigid: np.ndarray
-    pairs: np.ndarray
+    resonances: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,10 @@ class FirstOrder:
     rates, V, W : arrays (r,), (r, r), (r, r)
         Poles of the others, eigenvectors, and their inverse.
     pairs : tuple of int
-        Numbers in `rates` of complex pairs, the slowest first, each by its pole with Im λ > 0.
+        Numbers in `rates` of complex pairs, each by its pole with Im λ > 0: resonances, then the
+        others, the slowest first of both.
+    resonances : int
+        How many are.
     """
 
     system: StateSpace
@@ -81,6 +89,7 @@ class FirstOrder:
     V: np.ndarray
     W: np.ndarray
     pairs: tuple[int, ...]
+    resonances: int
 
     @property
     def at_rest(self) -> int:
@@ -88,10 +97,18 @@ class FirstOrder:
         return 2 * self.bodies + self.integrators
 
     @property
-    def of_integrators(self) -> Array | None:
-        """The residue (p, m) of 1/s of single integrators; None where there are none."""
-        single = slice(2 * self.bodies, self.at_rest)
-        return self.system.C[:, single] @ self.system.B[single] if self.integrators else None
+    def pushed(self) -> Array:
+        """Where forces move the sensors (p, m): at rest, or first, C Aⁿ B, where nothing rests."""
+        A, B, C = self.system.A, self.system.B, self.system.C
+        if not self.at_rest and (self.rates.real < 0.0).all():
+            return -C @ np.linalg.solve(A, B)
+        sizes, power = np.linalg.norm(A, 2), B
+        for n in range(len(A)):
+            small = 1e-12 * sizes**n * np.linalg.norm(B) * np.linalg.norm(C)
+            if np.linalg.norm(C @ power) > small:
+                break
+            power = A @ power
+        return C @ power
 
     def suspended(self, omega: float, damping_ratio: float) -> "FirstOrder":
         """The same with free bodies held by springs of ω in rad/s, or integrators by a leak. Raises
@@ -119,7 +136,7 @@ class FirstOrder:
         return scipy.linalg.block_diag(one, self.V), scipy.linalg.block_diag(one, self.W)
 
     def _turning(self) -> np.ndarray:
-        """P of ∂T = T P, from diag(N, Λ) P - P diag(N, Λ) = -T⁻¹∂A T beside the blocks that stay."""
+        """P of ∂T = T P, from diag(N, Λ) P - P diag(N, Λ) = -T⁻¹∂A T off the blocks that stay."""
         r, lam, (T, back) = self.at_rest, self.rates, self._basis
         N, E = self.system.A[:r, :r], back @ self.slopes.dA @ T
         gap, near = lam - lam[:, None], self._near
@@ -145,7 +162,8 @@ class FirstOrder:
             return self
         lam, r = self.rates, self.at_rest
         ratio, decay = np.ones(len(lam)), np.ones(len(lam))
-        for i, own in zip(self.pairs, [*single, *[0.0] * len(self.pairs)], strict=False):
+        resonant = self.pairs[: self.resonances]
+        for i, own in zip(resonant, [*single, *[0.0] * len(resonant)], strict=False):
             ratio[self._both(i)], decay[self._both(i)] = (1.0 + shift) * (1.0 + own), damping
         moved = ratio * (decay * lam.real + 1j * lam.imag)
         (T, back), P = self._basis, self._turning()
@@ -165,12 +183,13 @@ class FirstOrder:
 
     def _both(self, pair: int) -> np.ndarray:
         """The numbers of a pair's two poles."""
-        return np.abs(self.rates - self.rates[pair].conj()).argsort()[:1].tolist() + [pair]
+        return np.array([pair, np.abs(self.rates - self.rates[pair].conj()).argmin()])
 
     def to_point(self, name: str, value: float) -> tuple[Array, Array]:
         """∂A and ∂B to one of what `off` takes, by its name in a set, where it has a value."""
         word, _, number = name.partition(" ")
-        moved = self.pairs[int(number) - 1 : int(number)] if number else self.pairs
+        moved = self.pairs[: self.resonances]
+        moved = moved[int(number) - 1 : int(number)] if number else moved
         on = np.zeros(len(self.rates))
         for i in moved:
             on[self._both(i)] = 1.0
@@ -210,7 +229,7 @@ class FirstOrder:
             drive / even[:, None],
             reading * even,
             np.arange(n + len(pairs) + len(real)) < n,
-            n + np.arange(len(pairs)),
+            n + np.arange(self.resonances),
         )  # fmt: skip
 
 
@@ -261,10 +280,12 @@ def first_order(
         )
     lam = np.where(np.abs(lam.imag) <= options.on_axis * size, lam.real, lam)
     upper = np.flatnonzero(lam.imag > 0.0)
+    light = np.abs(lam[upper].real) < options.resonant * size[upper]
+    order = np.lexsort((size[upper], ~light))
     moved = Slopes(back @ slopes.dA @ T, back @ slopes.dB, slopes.dC @ T)
     return FirstOrder(
         strictly_proper(A, B, C), moved, n, k, lam, V, np.linalg.inv(V) if len(lam) else V,
-        tuple(upper[np.argsort(size[upper])].tolist()),
+        tuple(upper[order].tolist()), int(light.sum()),
     )  # fmt: skip
 
 

@@ -143,7 +143,7 @@ class ModalPlant:
     def numbered(self) -> np.ndarray:
         """The flexible modes in the order of their numbers, see `numbered`."""
         if self.states is not None:
-            return self.states.modes().pairs
+            return self.states.modes().resonances
         return numbered(self.modes, self.rigid)
 
     def driven(self, gain: float) -> "ModalPlant":

@@ -2,8 +2,9 @@
 
 A model is a function of theta (a mapping of names to floats or CasADi symbols) and keyword
 options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one of `damping` or
-`damping_ratio` (or `A`, `B`, `C` of first order in their place), `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0),
-`disturbance` (where other forces act) and `performance` (where the error counts).
+`damping_ratio` (or `A`, `B`, `C` of first order in their place), `hardware_cost` and optionally
+`constraints` (name to scalar, met where <= 0), `disturbance` (where other forces act) and
+`performance` (where the error counts).
 (Paper, equations (1) and (2).)
 """
 

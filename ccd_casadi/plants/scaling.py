@@ -323,8 +323,10 @@ def _scaled_states(modal: ModalPlant, states: FirstOrder, M_K: float, bare: bool
     t = np.append(np.ones(r), state_scales(A[r:, r:], B[r:], C[:, r:]))
     t[:r] /= np.linalg.norm(C[:, :r]) or 1.0
     t[n : 2 * n] *= omega_0
-    slopes = Slopes(states.slopes.dA / omega_0 * t / t[:, None],
-                    states.slopes.dB * (M_K / omega_0) / t[:, None], states.slopes.dC * t)  # fmt: skip
+    dA, dB, dC = states.slopes
+    slopes = Slopes(
+        dA / omega_0 * t / t[:, None], dB * (M_K / omega_0) / t[:, None], dC * t
+    )  # fmt: skip
     plant = strictly_proper(A * t / t[:, None], B / t[:, None], C * t)
     if modal.wiring:
         plant, slopes = modal.wiring.states(plant, slopes, omega_0)

@@ -13,7 +13,6 @@ from oracles.hard_plants import close
 from oracles.helpers import few
 from scipy.linalg import block_diag
 
-import ccd_casadi as ccd
 from ccd_casadi.extensions.cross_check.backends import balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
@@ -137,14 +136,15 @@ def as_first_order(theta: Mapping[str, Any], **options: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("held", [FREE, Suspension(0.1, 0.7)])
 def test_two_masses_are_the_same_in_both_forms(held: Suspension) -> None:
-    both = [build_plant(model, ["m1", "m2"], {"zeta": 0.01}) for model in (two_mass, as_first_order)]
+    models, names = (two_mass, as_first_order), ["m1", "m2"]
+    both = [build_plant(model, names, {"zeta": 0.01}) for model in models]
     modal = [modal_plant(mechanics(plant, (60.0, 50.0)), held) for plant in both]
     omega = np.geomspace(1.0, 1e4, 40)
     one, other = (response(scale_plant(each, 1e7).plant_si(), omega) for each in modal)
     assert np.abs(other / one - 1.0).max() < 1e-9
     assert modal[1].natural == pytest.approx(modal[0].natural)
     assert modal[1].rigid.tolist() == modal[0].rigid.tolist()
-    assert modal[1].C * modal[1].B.T == pytest.approx(modal[0].C * modal[0].B.T)
+    assert pytest.approx(modal[0].C * modal[0].B.T) == modal[1].C * modal[1].B.T
     assert np.diag(modal[1].D)[1] == pytest.approx(np.diag(modal[0].D)[1])
 
 
@@ -159,7 +159,7 @@ def test_off_the_model_pairs_move_and_real_poles_and_those_at_0_stay(
     assert before is not None
     assert after is not None
     r, lam = before.at_rest, before.rates
-    pairs = lam.imag != 0.0
+    pairs = (lam.imag != 0.0) & (np.abs(lam.real) < 0.3 * np.abs(lam))
     expected = np.where(pairs, (1.0 + shift) * (damping * lam.real + 1j * lam.imag), lam)
     found = np.linalg.eigvals(after.system.A[r:, r:])
     distance = np.abs(found[:, None] - expected).min(axis=0)
@@ -216,7 +216,7 @@ def model_of(**parts: Any) -> Plant:
 
 
 @pytest.mark.parametrize(
-    "parts, words",
+    ("parts", "words"),
     [
         ({"mass": np.eye(2)}, "returns A, B, C and mass"),
         ({"B": None}, "returns A, C; add B"),
@@ -231,7 +231,7 @@ def test_what_is_no_plant_of_first_order_is_refused(parts: dict[str, Any], words
 
 
 @pytest.mark.parametrize(
-    "A, words",
+    ("A", "words"),
     [
         (np.array([[-1.0, 1.0], [0.0, -1.0]]), "is not diagonalisable"),
         (np.eye(3, k=1), "three integrators in a row"),
