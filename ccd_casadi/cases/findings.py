@@ -209,7 +209,7 @@ def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float =
                 "correct its row of output, or leave it out"
             )
         if pushed is not None:
-            largest = min(float(largest), float(np.abs(pushed).max()))
+            largest = np.minimum(largest, np.abs(pushed).max())
         elif not rigid.any() and not away:
             largest /= float(np.abs(np.diag(modal.K)).max())
         if moved.sum() < -nothing * largest:

@@ -172,24 +172,20 @@ class UncertainPlant:
 
     def _to_point(self, states: FirstOrder, values: Array) -> FirstOrder:
         """A plant of first order with derivatives to the point; see `sloped`."""
-        system, count = states.system, len(self.ranges)
-        rows = []
-        for name, value in zip(self.names, values.tolist(), strict=True):
-            if name.startswith("theta."):
-                continue
-            by_gain = (0.0 * system.A, system.B / (1.0 + value))
-            rows.append(by_gain if name == "gain" else states.to_point(name, value))
-        found = []
-        for own, part, given in zip(
-            zip(*rows, strict=True) if rows else ((), ()),
-            (system.A, system.B),
-            states.slopes,
-            strict=False,
-        ):
-            found.append(np.array([*own, *given[len(given) - count :]]).reshape(-1, *part.shape))
-        dC = np.zeros((len(self.names), *system.C.shape))
-        dC[len(self.names) - count :] = states.slopes.dC[len(states.slopes.dC) - count :]
-        return replace(states, slopes=Slopes(*found, dC))
+        system, first = states.system, len(self.names) - len(self.ranges)
+        rows = [
+            (0.0 * system.A, system.B / (1.0 + value)) if name == "gain"
+            else states.to_point(name, value)
+            for name, value in zip(self.names[:first], values.tolist(), strict=False)
+        ]  # fmt: skip
+        own = len(states.slopes.dA) - len(self.ranges)  # to θ; after it to parameters of the model
+        dA, dB, dC = (d[own:] for d in states.slopes)
+        whole = Slopes(
+            np.array([*[row[0] for row in rows], *dA]).reshape(-1, *system.A.shape),
+            np.array([*[row[1] for row in rows], *dB]).reshape(-1, *system.B.shape),
+            np.concatenate([np.zeros((first, *system.C.shape)), dC]),
+        )
+        return replace(states, slopes=whole)
 
     def _off(self, point: Array, option: int) -> tuple[dict[str, float], Mechanics, Perturbation]:
         """A point's values by name, the matrices of its option there, and how modes are off."""
@@ -327,9 +323,9 @@ def modal_sum(
     uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
 ) -> ModalSum | None:
     """None of a plant of first order, and where a given damping matrix couples the modes (by more
-    than `uncoupled`, relative) or brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
-    damping ratio, one force, one sensor, a stiffness that holds them, and to be apart at the
-    model."""
+    than `uncoupled`, relative) or brakes a free body, or damps what the stiffness drives away.
+    Modes that move need a graph, a damping ratio, one force, one sensor, a stiffness that holds
+    them, and to be apart at the model."""
     system = uncertain.options[option]
     modal = uncertain.modal(option)
     if modal.states is not None:

@@ -14,6 +14,7 @@ from oracles.helpers import few
 from scipy.linalg import block_diag
 
 from ccd_casadi.extensions.cross_check.backends import balance, mixed_sensitivity, solve_slicot
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Filters, Wiring
@@ -121,6 +122,32 @@ def test_derivatives_are_those_of_the_response(
     R = np.linalg.inv(s * np.eye(len(own.A)) - own.A)
     found = dC @ R @ own.B + own.C @ R @ (dA @ R @ own.B + dB)
     assert distance(found, slope) < 1e-4
+
+
+@few(max_examples=10)
+@given(seeds, st.booleans())
+def test_a_set_has_derivatives_to_its_point(seed: int, ranged: bool) -> None:
+    """Also to a parameter of the model itself, which comes last."""
+    plant, h = drawn(seed), 1e-5
+    system = mechanics(plant, THETA)
+    ranges = (("p", 0.2, 0.3, 0.4),) if ranged else ()
+    uncertain = UncertainPlant(
+        (system,), 2.0, 0.03, 0.02, (0.5, 2.0), 0.1, ranges,
+        (lambda option, values: mechanics(plant, values)) if ranged else None,
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    point = uncertain.nominal + 0.3 * rng.uniform(size=len(uncertain.names)) * (
+        uncertain.box[1] - uncertain.nominal
+    )
+    here = uncertain.sloped(point)
+    own, s = here.plant_si(), 1j * OMEGA[:, None, None]
+    R = np.linalg.inv(s * np.eye(len(own.A)) - own.A)
+    for k, (dA, dB, dC) in enumerate(here.changes_si()):
+        step = h * np.eye(len(point))[k]
+        ends = [response(uncertain.sloped(point + e).plant_si(), OMEGA) for e in (-step, step)]
+        slope = (ends[1] - ends[0]) / (2.0 * h)
+        found = dC @ R @ own.B + own.C @ R @ (dA @ R @ own.B + dB)
+        assert distance(found, slope) < 1e-4, uncertain.names[k]
 
 
 def as_first_order(theta: Mapping[str, Any], **options: Any) -> dict[str, Any]:
