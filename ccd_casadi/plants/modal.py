@@ -290,12 +290,16 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     return replace(modal, **both, **drive, **shown, **left)
 
 
-def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()) -> None:
+def require_damping(
+    modal: ModalPlant, *, by_loop: bool = False, options: ModalOptions = ModalOptions()
+) -> None:
     """Check that every flexible mode is damped: the gain of an undamped one is infinite.
 
     Parameters
     ----------
     modal : ModalPlant
+    by_loop : bool
+        Whether the loop may damp what is driven and measured, as one with sections does.
     options : ModalOptions
 
     Raises
@@ -309,11 +313,19 @@ def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()
     wrong = np.flatnonzero(~rigid & (damping <= least))
     if not wrong.size:
         return
+    sizes = (np.linalg.norm(part, axis=1) for part in (modal.B, modal.C.T))
+    seen = np.logical_and(*(size > options.equal_outputs * size.max() for size in sizes))
+    if by_loop:
+        wrong = wrong[~seen[wrong] | (damping[wrong] < -least)]
+        if not wrong.size:
+            return
     i = wrong[0]
     words = "is not damped" if damping[i] >= -least else "has a negative damping"
+    holds = "the loop does not reach it" if by_loop else "no synthesis holds an infinite resonance"
+    remedy = "" if by_loop else ', or use controller.structure = "sections"'
     raise PlantError(
-        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: no synthesis holds an infinite "
-        "resonance; return a damping matrix that reaches it, or damping_ratio, such as 0.005"
+        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: {holds}; return a damping "
+        f"matrix that reaches it, or damping_ratio, such as 0.005{remedy}"
     )
 
 
