@@ -16,7 +16,7 @@ from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.fixed_parameters import reparametrised
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes
-from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, require_mechanics
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
@@ -310,7 +310,7 @@ class DrivenMechanics:
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         found, m = self.evaluate(self.own(theta)), self.mass(theta)
         if m:
-            require_mechanics(found, "the mass of a [motor]")
+            found.with_mass("the mass of a [motor]")
         B, (dM, dD, dK, dB, dC) = found.B[:, : self.inputs], found.derivatives
         if len(dM):
             own = dB[:, :, : self.inputs]

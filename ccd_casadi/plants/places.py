@@ -26,7 +26,7 @@ from ccd_casadi.plants.nodes import (
     in_axes,
     names_in,
 )
-from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, require_mechanics
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -285,8 +285,7 @@ class PlacedMechanics:
 
 def _flexible(system: Mechanics) -> tuple[Array, Array]:
     """ω in rad/s and shapes, as columns, of the flexible modes."""
-    require_mechanics(system, "[places]")
-    lam, modes, rigid = natural_modes(system.K, system.M)
+    lam, modes, rigid = natural_modes(system.with_mass("[places]").K, system.M)
     return np.sqrt(lam[~rigid]), modes[:, ~rigid]
 
 

@@ -90,30 +90,12 @@ class Mechanics:
         """Whether its function returned A, B, C: M = 0, D = 1, K = -A."""
         return not self.M.any() and np.array_equal(self.D, np.eye(len(self.D)))
 
-
-def require_mechanics(system: Mechanics, what: str) -> Mechanics:
-    """Check that a plant has mass and stiffness.
-
-    Parameters
-    ----------
-    system : Mechanics
-    what : str
-        That needs them, such as "[places]".
-
-    Returns
-    -------
-    Mechanics
-        The same.
-
-    Raises
-    ------
-    PlantError
-        Its function returned A, B and C.
-    """
-    if system.first_order:
-        words = f"{what} needs a plant function that returns mass, damping and stiffness, not A, B"
-        raise PlantError(f"{words} and C; return these, or leave it out")
-    return system
+    def with_mass(self, what: str) -> "Mechanics":
+        """The same. Raises PlantError of first order, where `what` needs mass and stiffness."""
+        if self.first_order:
+            words = f"{what} needs a plant function that returns mass, damping and stiffness"
+            raise PlantError(f"{words}, not A, B and C; return these, or leave it out")
+        return self
 
 
 def to_first_order(system: Mechanics, step: Array) -> Mechanics:

@@ -23,7 +23,6 @@ from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import Sampling, delay_parts
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.plant import require_mechanics
 from ccd_casadi.support.arrays import Array
 
 
@@ -92,7 +91,7 @@ class SampledModel:
         """A, B and C at values of the parameters; `size`: not below their entries' sizes for
         parameters of these sizes."""
         modal, system = self.uncertain.modal(self.option), self.uncertain.options[self.option]
-        require_mechanics(system, "[drive]")
+        system.with_mass("[drive]")
         p = dict(zip(self.uncertain.names, values.tolist(), strict=True))
         n, one = len(modal.K), 1.0
         r, number = np.ones(n), {at: i + 1 for i, at in enumerate(modal.numbered)}
