@@ -309,6 +309,8 @@ class DrivenMechanics:
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         found, m = self.evaluate(self.own(theta)), self.mass(theta)
+        if m:
+            found.with_mass("the mass of a [motor]")
         B, (dM, dD, dK, dB, dC) = found.B[:, : self.inputs], found.derivatives
         if len(dM):
             own = dB[:, :, : self.inputs]

@@ -169,7 +169,7 @@ def mass_feedforward(
     (m,) array or None
         N per unit acceleration; None where no rigid body moves it so.
     """
-    R = modal.C[:, modal.rigid] @ modal.B[modal.rigid]
+    R = modal.C[:, modal.rigid] @ modal.B[modal.rigid]  # integrators of first order are no mass
     if places:
         R, axis = np.array([places[0].output]) @ R, 0
     wanted = np.eye(len(R))[axis]

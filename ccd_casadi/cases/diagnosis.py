@@ -133,7 +133,8 @@ def diagnose(
             try:
                 system = mechanics(plant, theta, derivatives=index == 0)
                 modal = modal_plant(system, problem.suspension.free)
-                require_damping(modal)
+                sections = isinstance(problem.controller, StructuredProblem)
+                require_damping(modal, by_loop=sections)
                 scaled = scale_plant(without_hidden_rigid_modes(modal), problem.weights.M_K)
             except PlantError as error:
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"

@@ -194,18 +194,23 @@ def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float =
         pairs = [(f"the sensor of output {i + 1}", row, np.ones(1))
                  for i, row in enumerate(np.eye(p)) if m == 1]  # fmt: skip
     rigid, away = modal.rigid, bool(modal.driven_away.any())
+    pushed = None if modal.states is None else modal.states.pushed
     words = []
     for sensor, out, into in pairs:
         gains = (out @ modal.C) * (modal.B @ into)
         # of a free or driven-away body as it accelerates, else at rest
         moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
+        if pushed is not None:
+            moved = np.atleast_1d(out @ pushed @ into)
         largest = np.linalg.norm(out @ modal.C) * np.linalg.norm(modal.B @ into)
         if not largest > 0.0:
             words.append(
                 f"{sensor} reads nothing that the actuator moves: no design is made with it; "
                 "correct its row of output, or leave it out"
             )
-        if not rigid.any() and not away:
+        if pushed is not None:
+            largest = np.minimum(largest, np.abs(pushed).max())
+        elif not rigid.any() and not away:
             largest /= float(np.abs(np.diag(modal.K)).max())
         if moved.sum() < -nothing * largest:
             words.append(

@@ -289,7 +289,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     """None where the set shifts no resonance."""
     kind = kind_of(problem)
     low, high = kind.common_shifts()
-    if not high > low:
+    if not high > low or loops.plant.states is not None:
         return None
     factors, gains = kind.other_factors()
     bounds = kind.bounds()
@@ -298,8 +298,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     def judged(of: LoopsOffModel) -> SetCertificate:
         plants = []
         for place, gain in product(places, sorted(set(gains))):
-            modal = of.modal(place)
-            modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
+            modal = of.modal(place).driven(gain)
             plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
         return certify(plants, of.controller, bounds, of.sampling)
 

@@ -98,6 +98,9 @@ class LoopsOffModel:
 
     def modal(self, off: Perturbation) -> ModalPlant:
         """The plant itself; single modes are not shifted."""
+        if self.plant.states is not None:
+            states = self.plant.states.off(off.shift, off.damping, ())
+            return replace(self.plant, states=states)
         flexible = np.where(self.plant.rigid, 0.0, np.diag(self.plant.K))
         K = self.plant.K + np.diag(((1.0 + off.shift) ** 2 - 1.0) * flexible)
         D = self.rest + off.damping * (self.matrix + off.shift * self.grows)
@@ -182,7 +185,7 @@ def loops_off_model(
     plant = modal(Perturbation())
     matrix = D(Perturbation(damping=2.0)) - plant.D
     grows = (D(Perturbation(shift=0.5)) - plant.D) / 0.5
-    given = system.damping_ratio is None
+    given = system.damping_ratio is None and not system.first_order
     rest = plant.D - matrix
     return LoopsOffModel(plant, controller, sampling, rest, matrix, grows, given, places)
 

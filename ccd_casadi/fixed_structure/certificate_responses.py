@@ -121,6 +121,8 @@ class Triangular:
 class LoopResponses:
     """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
     K of the controller, which may have an `integrator`.
+
+    At a pole of G on the axis S, KS, T and GS have limits, which are taken a little beside it.
     """
 
     def __init__(
@@ -137,6 +139,7 @@ class LoopResponses:
         self.free = None if bare else Triangular(free)
         self.period = None if sampling is None else sampling.period
         self.bounds, self.integrator = bounds, integrator
+        self.plants = free
 
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
@@ -202,7 +205,15 @@ class LoopResponses:
         _, g, k = self._loops(which, omega)
         return np.asarray(np.linalg.svd(_product(g, k), compute_uv=False)[..., ::-1])
 
+    def _off_poles(self, which: np.ndarray, omega: Array) -> Array:
+        """ω (N, k), at poles on the axis a little more."""
+        if not any(len(one.on_axis) for one in self.plants):
+            return omega
+        pairs = zip(which, omega, strict=True)
+        return np.array([self.plants[i].off_poles(each, self.period) for i, each in pairs])
+
     def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
+        omega = self._off_poles(which, omega)
         S, g, k = self._loops(which, omega)
         free = g if self.free is None else self.free.at(which, 1j * omega)
         KS = _product(k, S)
@@ -212,6 +223,7 @@ class LoopResponses:
         return found
 
     def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        omega = self._off_poles(which, omega)
         s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
         g, k = self.G.at(which, s), self.K.at(which, s)
         open_ = np.eye(g.shape[-2]) + _product(g, k)

@@ -21,7 +21,9 @@ import numpy as np
 from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.as_written import as_written
+from ccd_casadi.plants.first_order import FirstOrder
 from ccd_casadi.plants.modal import (
     FREE,
     ModalPlant,
@@ -80,7 +82,7 @@ class UncertainPlant:
     def modes(self) -> int:
         """The largest number of flexible modes of any option."""
         plants = [modal_plant(option, self._free) for option in self.options]
-        return max(int((~plant.rigid).sum()) for plant in plants)
+        return max(len(plant.numbered) for plant in plants)
 
     @property
     def _free(self) -> Suspension:
@@ -124,6 +126,11 @@ class UncertainPlant:
         """The scaled plant at a point of the box; its derivatives are those to θ."""
         modal, count = self._modal(point, option), len(self.ranges)
         if count:
+            if (states := modal.states) is not None:
+                dA, dB, dC = (d[:-count] for d in states.slopes)
+                own = Slopes(dA, dB, dC)
+                return scale_plant(replace(modal, states=replace(states, slopes=own)), self.M_K,
+                                   bare=True)  # fmt: skip
             modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
         return scale_plant(modal, self.M_K, bare=True)
 
@@ -136,6 +143,9 @@ class UncertainPlant:
         Those to parameters of the model are the model's own.
         """
         modal, values = self._modal(point, option), np.asarray(point, float)
+        if modal.states is not None:
+            return scale_plant(replace(modal, states=self._to_point(modal.states, values)),
+                               self.M_K, bare=True)  # fmt: skip
         flexible = np.flatnonzero(~modal.rigid)
         count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
         dM, dK, dD = np.zeros((3, count, n, n))
@@ -160,6 +170,23 @@ class UncertainPlant:
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
         return scale_plant(moved, self.M_K, bare=True)
 
+    def _to_point(self, states: FirstOrder, values: Array) -> FirstOrder:
+        """A plant of first order with derivatives to the point; see `sloped`."""
+        system, first = states.system, len(self.names) - len(self.ranges)
+        rows = [
+            (0.0 * system.A, system.B / (1.0 + value)) if name == "gain"
+            else states.to_point(name, value)
+            for name, value in zip(self.names[:first], values.tolist(), strict=False)
+        ]  # fmt: skip
+        own = len(states.slopes.dA) - len(self.ranges)  # to θ; after it to parameters of the model
+        dA, dB, dC = (d[own:] for d in states.slopes)
+        whole = Slopes(
+            np.array([*[row[0] for row in rows], *dA]).reshape(-1, *system.A.shape),
+            np.array([*[row[1] for row in rows], *dB]).reshape(-1, *system.B.shape),
+            np.concatenate([np.zeros((first, *system.C.shape)), dC]),
+        )
+        return replace(states, slopes=whole)
+
     def _off(self, point: Array, option: int) -> tuple[dict[str, float], Mechanics, Perturbation]:
         """A point's values by name, the matrices of its option there, and how modes are off."""
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
@@ -177,9 +204,7 @@ class UncertainPlant:
         modal = modal_plant(system, self._free, off)
         modal = without_hidden_rigid_modes(modal)
         gain = 1.0 + values.get("gain", 0.0)
-        if gain != 1.0:
-            modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
-        return modal
+        return modal if gain == 1.0 else modal.driven(gain)
 
     def plants(self, points: Sequence[tuple[int, Array]]) -> list[ScaledPlant]:
         """The plants of (option, point) pairs."""
@@ -309,12 +334,14 @@ class ModalSum:
 def modal_sum(
     uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
 ) -> ModalSum | None:
-    """None where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
-    brakes a free body, or damps what the stiffness drives away. Modes that move need a graph, a
-    damping ratio, one force, one sensor, a stiffness that holds them, and to be apart at the
-    model."""
+    """None of a plant of first order, and where a given damping matrix couples the modes (by more
+    than `uncoupled`, relative) or brakes a free body, or damps what the stiffness drives away.
+    Modes that move need a graph, a damping ratio, one force, one sensor, a stiffness that holds
+    them, and to be apart at the model."""
     system = uncertain.options[option]
     modal = uncertain.modal(option)
+    if modal.states is not None:
+        return None
     zeta = float(system.damping_ratio or 0.0)
     given, away = modal.D - np.diag(2.0 * zeta * modal.natural), modal.driven_away
     omega = np.where(away, np.sqrt(np.abs(np.diag(modal.K))), modal.natural)

@@ -300,7 +300,8 @@ def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
 
     def scaled(off: Perturbation, held: Suspension = suspension.free) -> ScaledPlant:
         modal = without_hidden_rigid_modes(modal_plant(system, held, off))
-        require_damping(modal)
+        mixed = isinstance(problem.controller, MixedSensitivityProblem)
+        require_damping(modal, by_loop=not mixed)
         return scale_plant(modal, problem.weights.M_K)
 
     nominal = scaled(NOMINAL)

@@ -330,6 +330,7 @@ class Loop:
         if self.sampling is None or self.plant.modes is None:
             return G.swept(omega), K.swept(omega)
         poles, drive, reading = self.plant.modes
+        omega = self.plant.off_poles(omega, self.sampling.period)
         f = transfer(poles, omega, self.sampling.period, self.sampling.delay)
         return np.asarray((reading * f[:, None, :]) @ drive), K.swept(omega)
 

@@ -49,12 +49,36 @@ class StateSpace:
         return self.at(self.variable(omega))
 
     def swept(self, omega: Array) -> np.ndarray:
-        """`response` at many frequencies: by eigenvectors where these are sound (cond < 1e8)."""
+        """`response` at many frequencies: by eigenvectors where these are sound (cond < 1e8).
+
+        `off_poles`, so that loops of undamped plants have S, KS, T and GS there.
+        """
+        omega = self.off_poles(omega)
         if self.modes is None:
             return self.response(omega)
         poles, drive, reading = self.modes
         parts = reading / (self.variable(omega)[:, None] - poles)[:, None, :]
         return np.asarray(parts @ drive + self.D)
+
+    def off_poles(
+        self, omega: Array, period: float | None = None, *, beside: float = 1e-8
+    ) -> Array:
+        """ω (k,) in rad/s, a little more where a pole on the axis is nearer than `beside` of ω; of
+        what is sampled with a `period` in s also where it shows as an alias."""
+        fold, on_axis = np.pi / (period or np.inf), self.on_axis
+        if period:
+            on_axis = np.append(on_axis, np.abs((on_axis + fold) % (2.0 * fold) - fold))
+        for on in on_axis:
+            near = np.abs(omega - on) < beside * omega
+            omega = np.where(near, (1.0 + 2.0 * beside) * omega, omega)
+        return omega
+
+    @cached_property
+    def on_axis(self) -> Array:
+        """Frequencies in rad/s of its poles on the axis, but for 0."""
+        rates = self.rates
+        on = (np.abs(rates.real) <= 1e-7 * np.abs(rates)) & (rates.imag > 0.0)
+        return np.asarray(rates.imag[on])
 
     def variable(self, omega: Array) -> np.ndarray:
         """s or z (k,) at ω (k,) in rad/s."""
@@ -167,14 +191,30 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     -------
     A, B, C : arrays of the same shapes
     """
+    t = state_scales(A, B, C)
+    parts = A * t / t[:, None], B / t[:, None], C * t
+    A, B, C = (np.ascontiguousarray(part) for part in parts)
+    return A, B, C
+
+
+def state_scales(A: Array, B: Array, C: Array) -> Array:
+    """Find the T of `balanced`.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+
+    Returns
+    -------
+    array (n,)
+        Powers of two.
+    """
     n, m, p = len(A), B.shape[1], C.shape[0]
     system = np.zeros((n + m + p, n + m + p))
     system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
     with np.errstate(invalid="ignore"):  # scales beyond 64 bits, as integers that nobody reads
-        even, _ = matrix_balance(system, permute=False)
-    parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
-    A, B, C = (np.ascontiguousarray(part) for part in parts)
-    return A, B, C
+        scales = matrix_balance(system, permute=False, separate=True)[1][0]
+    return np.asarray(scales[:n], float)
 
 
 def weighted(system: StateSpace, filters: Array) -> StateSpace:

@@ -14,6 +14,7 @@ the damping and a gain g,
     K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
     D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
 
+A plant of first order is as its function returned it, and off its model as `first_order` has it.
 A motion that K drives away, λ_i < 0, has ω_i = 0 here: ζ damps none.
 """
 
@@ -22,6 +23,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.lti.wiring import Slopes
+from ccd_casadi.plants.first_order import first_order
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered
 from ccd_casadi.support.arrays import Array
@@ -61,6 +64,13 @@ def as_written(
     PlantError
         Where it is not known which modes are rigid, or no controller can hold one.
     """
+    if system.first_order:
+        system_of = strictly_proper(-system.K, (1.0 + gain) * system.B, system.C)
+        if shift or damping != 1.0 or any(modes):
+            none = Slopes(*(np.zeros((0, *part.shape)) for part in (system.K, system.B, system.C)))
+            states = first_order(system_of.A, system_of.B, system_of.C, none)
+            system_of = states.off(shift, damping, modes).system
+        return system.wiring.around(system_of)
     lam, shapes, rigid = natural_modes(system.K, system.M, rigid_modes)
     own = np.zeros(len(lam))
     single = numbered(shapes, rigid)[: len(modes)]

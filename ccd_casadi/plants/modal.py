@@ -18,7 +18,8 @@ from itertools import pairwise
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
-from ccd_casadi.lti.wiring import UNWIRED, Wiring
+from ccd_casadi.lti.wiring import UNWIRED, Slopes, Wiring
+from ccd_casadi.plants.first_order import FirstOrder, first_order
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered, placed
 from ccd_casadi.support.arrays import Array
@@ -114,6 +115,8 @@ class ModalPlant:
         Derivatives to θ, leading axis θ.
     wiring : Wiring
         What lies before the forces and behind the sensors.
+    states : FirstOrder, optional
+        The plant itself where its function gives A, B, C; all above then describes its poles.
     """
 
     K: Array
@@ -129,6 +132,7 @@ class ModalPlant:
     dB: Array
     dC: Array
     wiring: Wiring = UNWIRED
+    states: FirstOrder | None = None
 
     @property
     def driven_away(self) -> np.ndarray:
@@ -138,11 +142,20 @@ class ModalPlant:
     @property
     def numbered(self) -> np.ndarray:
         """The flexible modes in the order of their numbers, see `numbered`."""
+        if self.states is not None:
+            return self.states.modes().resonances
         return numbered(self.modes, self.rigid)
+
+    def driven(self, gain: float) -> "ModalPlant":
+        """With B times a factor."""
+        states = self.states and self.states.driven(gain)
+        return replace(self, B=gain * self.B, dB=gain * self.dB, states=states)
 
     @property
     def state_space(self) -> StateSpace:
         """[q; q̇] in SI, velocities in units in which a mode's energy is even, as it is wired."""
+        if self.states is not None:
+            return self.wiring.around(self.states.system)
         n, k = len(self.K), np.abs(np.diag(self.K))
         scale = np.sqrt(np.where(k > 1e-12, k, 1.0))
         A = np.zeros((2 * n, 2 * n))
@@ -180,6 +193,8 @@ def modal_plant(
     PlantError
         It is not known whether K resists a motion.
     """
+    if system.first_order:
+        return _of_states(system, suspension, perturbation)
     lam, modes, rigid = natural_modes(system.K, system.M, suspension.rigid_modes)
     w_r = 2.0 * np.pi * suspension.frequency_hz
     modes = _aligned(modes, lam, system.C, options.equal_outputs)
@@ -227,6 +242,23 @@ def modal_plant(
     )
 
 
+def _of_states(system: Mechanics, held: Suspension, off: Perturbation) -> ModalPlant:
+    """A plant of first order, with its poles as modes without derivatives."""
+    _, _, dK, dB, dC = system.derivatives
+    states = first_order(-system.K, system.B, system.C, Slopes(-dK, dB, dC))
+    states = states.off(off.shift, off.damping, off.modes)
+    if held.frequency_hz:
+        states = states.suspended(2.0 * np.pi * held.frequency_hz, held.damping_ratio)
+    k, d, B, C, rigid, _ = states.modes()
+    n, none = len(k), np.zeros((len(dK), len(k), len(k)))
+    if not n:
+        raise PlantError("A has no pole but single ones at 0; add what the force accelerates")
+    return ModalPlant(
+        np.diag(k), np.diag(d), B, C, np.sqrt(np.maximum(k, 0.0)), rigid, np.eye(n), none, none,
+        none, np.zeros((len(dK), *B.shape)), np.zeros((len(dK), *C.shape)), system.wiring, states,
+    )  # fmt: skip
+
+
 def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     """Remove rigid-body motions that are neither driven nor measured.
 
@@ -243,7 +275,7 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     """
     own = np.flatnonzero(modal.rigid)
     sizes = np.linalg.norm(modal.B, 2), np.linalg.norm(modal.C, 2)
-    if not own.size or not all(sizes):
+    if not own.size or not all(sizes) or modal.states is not None:
         return modal
     T, back = driven_and_measured(modal.B[own] / sizes[0], modal.C[:, own] / sizes[1])
     count = T.shape[1]
@@ -258,12 +290,16 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     return replace(modal, **both, **drive, **shown, **left)
 
 
-def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()) -> None:
+def require_damping(
+    modal: ModalPlant, *, by_loop: bool = False, options: ModalOptions = ModalOptions()
+) -> None:
     """Check that every flexible mode is damped: the gain of an undamped one is infinite.
 
     Parameters
     ----------
     modal : ModalPlant
+    by_loop : bool
+        Whether the loop may damp what is driven and measured, as one with sections does.
     options : ModalOptions
 
     Raises
@@ -277,11 +313,19 @@ def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()
     wrong = np.flatnonzero(~rigid & (damping <= least))
     if not wrong.size:
         return
+    sizes = (np.linalg.norm(part, axis=1) for part in (modal.B, modal.C.T))
+    seen = np.logical_and(*(size > options.equal_outputs * size.max() for size in sizes))
+    if by_loop:
+        wrong = wrong[~seen[wrong] | (damping[wrong] < -least)]
+        if not wrong.size:
+            return
     i = wrong[0]
     words = "is not damped" if damping[i] >= -least else "has a negative damping"
+    holds = "the loop does not reach it" if by_loop else "no synthesis holds an infinite resonance"
+    remedy = "" if by_loop else ', or use controller.structure = "sections"'
     raise PlantError(
-        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: no synthesis holds an infinite "
-        "resonance; return a damping matrix that reaches it, or damping_ratio, such as 0.005"
+        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: {holds}; return a damping "
+        f"matrix that reaches it, or damping_ratio, such as 0.005{remedy}"
     )
 
 

@@ -285,7 +285,7 @@ class PlacedMechanics:
 
 def _flexible(system: Mechanics) -> tuple[Array, Array]:
     """ω in rad/s and shapes, as columns, of the flexible modes."""
-    lam, modes, rigid = natural_modes(system.K, system.M)
+    lam, modes, rigid = natural_modes(system.with_mass("[places]").K, system.M)
     return np.sqrt(lam[~rigid]), modes[:, ~rigid]
 
 

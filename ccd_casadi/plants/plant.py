@@ -2,8 +2,9 @@
 
 A model is a function of theta (a mapping of names to floats or CasADi symbols) and keyword
 options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one of `damping` or
-`damping_ratio`, `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0),
-`disturbance` (where other forces act) and `performance` (where the error counts).
+`damping_ratio` (or `A`, `B`, `C` of first order in their place), `hardware_cost` and optionally
+`constraints` (name to scalar, met where <= 0), `disturbance` (where other forces act) and
+`performance` (where the error counts).
 (Paper, equations (1) and (2).)
 """
 
@@ -29,6 +30,7 @@ Evaluate = Callable[[Sequence[float]], "Mechanics"]
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 MATRICES = ("mass", "damping", "stiffness", "input", "output")
 PORTS = {"disturbance": "input", "performance": "output"}  # optional, and what they stand beside
+FIRST_ORDER = ("A", "B", "C", "D")
 _KNOWN = {*_REQUIRED, *PORTS, "damping", "damping_ratio", "constraints"}
 
 
@@ -82,6 +84,18 @@ class Mechanics:
     def matrices(self) -> tuple[Array, Array, Array, Array, Array]:
         """M, D, K, B, C."""
         return self.M, self.D, self.K, self.B, self.C
+
+    @property
+    def first_order(self) -> bool:
+        """Whether its function returned A, B, C: M = 0, D = 1, K = -A."""
+        return not self.M.any() and np.array_equal(self.D, np.eye(len(self.D)))
+
+    def with_mass(self, what: str) -> "Mechanics":
+        """The same. Raises PlantError of first order, where `what` needs mass and stiffness."""
+        if self.first_order:
+            words = f"{what} needs a plant function that returns mass, damping and stiffness"
+            raise PlantError(f"{words}, not A, B and C; return these, or leave it out")
+        return self
 
 
 def to_first_order(system: Mechanics, step: Array) -> Mechanics:
@@ -254,7 +268,7 @@ def widened(model: ModelFunction) -> ModelFunction:
     """
 
     def of_both(theta: Mapping[str, Any], **options: Any) -> Mapping[str, Any]:
-        found = dict(model(theta, **options))
+        found = _of_mechanics(model(theta, **options))
         for key, beside in PORTS.items():
             if key in found:
                 own, other = found[beside], found.pop(key)
@@ -274,6 +288,7 @@ def model_parts(
     if not isinstance(result, Mapping):
         words = "returned None" if result is None else f"returned a {type(result).__name__}"
         raise PlantError(f"the plant function {words}; let it return a mapping, such as a dict")
+    result = _of_mechanics(result)
     constraints = result.get("constraints", {})
     if not isinstance(constraints, Mapping):
         words = f"constraints is a {type(constraints).__name__}; return a mapping of name to value"
@@ -318,6 +333,31 @@ def model_parts(
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
     return (M, D, K, B, C), ratio, scalars
+
+
+def _of_mechanics(result: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with 0 q̈ + q̇ - A q = B u, y = C q in the place of A, B and C. Raises PlantError
+    where these are beside mass or stiffness, incomplete, not square, or D is not 0."""
+    found = dict(result)
+    given = {key: found.pop(key) for key in FIRST_ORDER if key in found}
+    if not given:
+        return found
+    both = [key for key in (*MATRICES, "damping_ratio") if key in found]
+    if both:
+        words = f"the plant model returns {', '.join(given)} and {', '.join(both)}"
+        raise PlantError(f"{words}; return A, B, C alone, or mass, stiffness, input, output")
+    if missing := [key for key in ("A", "B", "C") if key not in given]:
+        raise PlantError(f"the plant model returns {', '.join(given)}; add {', '.join(missing)}")
+    kinds = [ca.SX if isinstance(value, ca.SX) else ca.DM for value in given.values()]
+    kind = ca.SX if ca.SX in kinds else ca.DM
+    A, *_ = parts = [_converted(kind, key, value) for key, value in given.items()]
+    if A.shape[0] != A.shape[1]:
+        raise PlantError(f"A is {A.shape}; make it square, a row a state")
+    if "D" in given and not kind(parts[-1]).is_zero():
+        words = "D is not 0: a force moves the sensor at once"
+        raise PlantError(f"{words}; add the state of what rolls it off, or drop D")
+    found |= {"mass": kind.zeros(*A.shape), "damping": kind.eye(A.shape[0]), "stiffness": -A}
+    return {**found, "input": given["B"], "output": given["C"]}
 
 
 def _is_comparison(value: Any) -> bool:
@@ -411,6 +451,8 @@ def mechanics(
     M, K = system.M, system.K
     place = f"at theta = {named_values(plant.names, theta)}"
     _require_finite(plant, system, place, options.largest_entry)
+    if system.first_order:
+        return system
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():
@@ -453,8 +495,9 @@ def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[
 
 def _require_finite(plant: Plant, system: Mechanics, place: str, largest: float) -> None:
     """Raise PlantError that names the first entry, or its slope, that is no number or too large."""
-    entries = [*zip(MATRICES, system.matrices, strict=True)]
-    for key, slopes in zip(MATRICES, system.derivatives, strict=True):
+    keys = ("mass", "damping", "-A", "B", "C") if system.first_order else MATRICES
+    entries = [*zip(keys, system.matrices, strict=True)]
+    for key, slopes in zip(keys, system.derivatives, strict=True):
         entries += [(f"the derivative of {key} to {name}", slope)
                     for name, slope in zip(plant.names, slopes, strict=False)]  # fmt: skip
     for what, matrix in entries:
@@ -467,7 +510,7 @@ def _require_finite(plant: Plant, system: Mechanics, place: str, largest: float)
             words = f"the plant has an entry beyond {largest:g} {place}: {entry}"
             raise PlantError(f"{words}; choose other units")
         remedy = "keep divisions, roots and logarithms in their range over all bounds of theta"
-        if what not in MATRICES:
+        if what not in keys:
             remedy = "its value is finite: a root or power of 0, or abs, has no slope; smooth it"
         raise PlantError(f"the plant is not finite {place}: {entry}; {remedy}")
 

@@ -8,8 +8,9 @@ import scipy
 
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
-from ccd_casadi.lti.state_space import StateSpace, balanced, strictly_proper
+from ccd_casadi.lti.state_space import StateSpace, balanced, state_scales, strictly_proper
 from ccd_casadi.lti.wiring import Slopes
+from ccd_casadi.plants.first_order import FirstOrder
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -268,6 +269,8 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     PlantError
         No mode is both driven and measured.
     """
+    if modal.states is not None:
+        return _scaled_states(modal, modal.states, M_K, bare)
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
     omega_0 = float(np.sqrt(M_K * np.linalg.norm(b) * np.linalg.norm(c)))
@@ -312,6 +315,27 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
 
 
+def _scaled_states(modal: ModalPlant, states: FirstOrder, M_K: float, bare: bool) -> ScaledPlant:
+    """A plant of first order; ω₀ as `scale_state_space` has it, free bodies alike."""
+    system, n, r = states.system, states.bodies, states.at_rest
+    omega_0 = _unit_of_frequency(system, M_K)
+    A, B, C = system.A / omega_0, system.B * (M_K / omega_0), system.C
+    t = np.append(np.ones(r), state_scales(A[r:, r:], B[r:], C[:, r:]))
+    t[:r] /= np.linalg.norm(C[:, :r]) or 1.0
+    t[n : 2 * n] *= omega_0
+    dA, dB, dC = states.slopes
+    slopes = Slopes(
+        dA / omega_0 * t / t[:, None], dB * (M_K / omega_0) / t[:, None], dC * t
+    )  # fmt: skip
+    plant = strictly_proper(A * t / t[:, None], B / t[:, None], C * t)
+    if modal.wiring:
+        plant, slopes = modal.wiring.states(plant, slopes, omega_0)
+    parts = (np.empty(0), np.empty(0)) if bare else _gains(plant.A, plant.B, plant.C)
+    return ScaledPlant(
+        plant.A, plant.B, plant.C, omega_0, M_K, *parts, modal.natural, *slopes
+    )  # fmt: skip
+
+
 def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     """The scaled plant of any strictly proper state space in SI, for weights with this M_K (N/m).
 
@@ -326,16 +350,21 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
         raise PlantError("its state space is not finite")
     if np.any(system.D):
         raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
-    order, inertial = leading_gain(system)
-    if not order:
-        raise PlantError("C Aⁿ B is zero for every n: no force accelerates what is measured")
-    omega_0 = float((M_K * inertial) ** (1.0 / order))
+    omega_0 = _unit_of_frequency(system, M_K)
     A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
     grid, gain = _gains(A, B, C)
     poles = np.linalg.eigvals(system.A)
     natural = np.sort(np.abs(poles[poles.imag >= 0.0]))
     none = (np.zeros((0, n, n)), np.zeros((0, n, m)), np.zeros((0, p, n)))
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
+
+
+def _unit_of_frequency(system: StateSpace, M_K: float) -> float:
+    """ω₀ in rad/s; see `scale_state_space`."""
+    order, inertial = leading_gain(system)
+    if not order:
+        raise PlantError("C Aⁿ B is zero for every n: no force accelerates what is measured")
+    return float((M_K * inertial) ** (1.0 / order))
 
 
 def leading_gain(system: StateSpace, *, rounding: float = 1e-13) -> tuple[int, float]:

@@ -106,10 +106,11 @@ def structured_bound(
     plant: ScaledPlant, modal: ModalPlant, controller: StateSpace, hz: Array,
     options: StructuredBoundOptions = StructuredBoundOptions(),
 ) -> StructuredBound | None:  # fmt: skip
-    """From a grid in Hz, refined where it is decided; None without a flexible mode in the loop."""
+    """From a grid in Hz, refined where it is decided; None without a flexible mode in the loop,
+    and of a plant of first order, whose modes are not masses on springs."""
     residue = np.linalg.norm(modal.B, axis=1) * np.linalg.norm(modal.C, axis=0)
     kept = np.flatnonzero(~modal.rigid & (residue > options.seen * residue.max()))
-    if kept.size == 0:
+    if kept.size == 0 or modal.states is not None:
         return None
     poles = resonant(closed_loop(plant.plant_si(), controller).S.poles)
     flanks = np.linspace(-options.flank, options.flank, options.flank_points)

@@ -34,6 +34,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Progress
+from ccd_casadi.support.text import HZ
 
 
 def sampled_compliance(
@@ -171,12 +172,10 @@ def single_modes(run: FinishedRun, reach: float) -> tuple[PerturbedLoop, ...]:
     modal = run.modal()
     residue = np.linalg.norm(modal.B, axis=1) * np.linalg.norm(modal.C, axis=0)
     found = []
-    for i in np.flatnonzero(~modal.rigid & (residue > 1e-9 * residue.max())):
-        for shift in (-reach, reach):
-            K = modal.K.copy()
-            K[i, i] *= (1.0 + shift) ** 2
-            place = (float(modal.natural[i]) / (2.0 * np.pi), shift)
-            found.append(judge(run, replace(modal, K=K), place))
+    for number, i in enumerate(modal.numbered):
+        for shift in (-reach, reach) if residue[i] > 1e-9 * residue.max() else ():
+            off = Perturbation(modes=(*[0.0] * number, shift))
+            found.append(judge(run, run.modal(off), (float(modal.natural[i]) / HZ, shift)))
     return tuple(found)
 
 

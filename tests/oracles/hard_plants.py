@@ -4,15 +4,24 @@
 `irregular`: D12 or D21 without full rank, or a zero on the axis; Riccati solvers may have neither.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import control
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.cross_check.backends import StandardPlant
+from ccd_casadi.extensions.cross_check.backends import (
+    StandardPlant,
+    balance,
+    mixed_sensitivity,
+    solve_slicot,
+)
+from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 Rows = list[list[float]]
 
@@ -263,3 +272,34 @@ HARD = {
         HardPlant("COMPleib HE5", compleib_HE5()),
     )
 }  # fmt: skip
+
+
+def drawn_weights(rng: np.random.Generator, w0: float, disturbed: bool = False) -> Weights:
+    """Weights about ω₀ in rad/s, of M_K = 1."""
+    return Weights(
+        M_S=rng.uniform(1.2, 3.0), A_S=10.0 ** rng.uniform(-3.0, -1.0),
+        omega_S=w0 * 10.0 ** rng.uniform(-1.5, 0.5), c_K=10.0 ** rng.uniform(1.0, 3.0),
+        omega_K=w0 * 10.0 ** rng.uniform(0.0, 1.5), M_K=1.0, A_l=rng.uniform(0.8, 1.5),
+        A_u=10.0 ** rng.uniform(-2.0, -0.5), omega_T=w0 * 10.0 ** rng.uniform(0.0, 1.5),
+        disturbance=10.0 ** rng.uniform(-1.0, 1.0) if disturbed else 0.0,
+    )  # fmt: skip
+
+
+def far_from_sb10ad(plant: ScaledPlant, own: ScaledPlant, weights: Weights) -> float:
+    """The distance of the γ_opt of a plant from SB10AD's of `own`, on which its controller is
+    judged too; NaN where it is useless or the bound limits it."""
+    w0 = own.omega_0
+    done = synthesise(plant, weights, omega_low=1e-2 * w0)
+    figures = done.figures
+    if figures.gamma_opt > 1e3:  # zeros beside unstable poles: rounding decides
+        return np.nan
+    assert figures.certificate.passed, figures.outcome
+    assert len(done.controller.A) == len(plant.A) + 3 * len(plant.C)  # as of a stable plant
+    standard, K = balance(mixed_sensitivity(own, weights)), done.controller
+    norm = hinf_norm(close(standard, StateSpace(K.A / w0, K.B / w0, K.C, K.D)))[0]
+    assert norm <= figures.certificate.norm_bound * (1.0 + 1e-8)
+    if figures.limited_by_bound:  # which SB10AD decides by rounding
+        return np.nan
+    s = 1e3 / figures.gamma_opt  # it searches to absolute tolerances
+    standard = replace(standard, C1=s * standard.C1, D11=s * standard.D11, D12=s * standard.D12)
+    return abs(solve_slicot(standard).gamma_opt / 1e3 - 1.0)

@@ -34,6 +34,7 @@ from ccd_casadi.extensions.limitations.limits import (
 )
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
 from ccd_casadi.extensions.limitations.of_problem import (
+    classic_limits,
     gap_of,
     limits_of_problem,
     none_reaches,
@@ -45,6 +46,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scale
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
+from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise
@@ -315,3 +317,51 @@ def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
     bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, omega_low, None, level, weights)
     assert loop.crossing <= upper_bound(limits_of(plant.plant_si(), bounds, None)) < np.inf
+
+
+@pytest.mark.parametrize("seed", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
+def test_no_design_of_an_unstable_plant_exceeds_the_bound_or_the_least_peaks(seed: int) -> None:
+    """A pole in the right half plane, and a zero: with seed 2 the zero is on the other side."""
+    rng = np.random.default_rng(seed)
+    pole, zero = rng.uniform(0.5, 2.0), rng.uniform(10.0, 30.0) * (-1.0 if seed == 2 else 1.0)
+    A = np.array([[pole, 1.0], [0.0, -5.0]])
+    C = -np.sign(zero) * np.array([[pole - zero, 1.0]])  # ±(s - zero)/((s - pole)(s + 5))
+    own = StateSpace(A, np.array([[0.0], [1.0]]), C, np.zeros((1, 1)))
+    plant = scale_state_space(own, 1.0)
+    w0 = plant.omega_0
+    weights = Weights(2.0, 1e-2, 10.0, 30.0 * w0, 1.0, 1.0, 1.0, 1e-2, 3.0 * w0, w0)
+    made = synthesise(plant, weights, omega_low=1e-2 * w0)
+    controller = recertified_in_si(plant, made, 1e-2 * w0).controller
+    loose = Bounds(50.0, 1.0, 1e-2 * w0, weighted_level=1e9, weights=weights)
+    loop = judged([plant.plant_si()], controller, loose, None, False)[0]
+    level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
+    bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, 1e-2 * w0, None, level, weights)
+    limits = limits_of(plant.plant_si(), bounds, None)
+    assert loop.crossing <= upper_bound(limits) < np.inf
+    assert limits.unstable == pytest.approx((pole,))
+    words = classic_limits(limits)
+    blaschke = (zero + pole) / (zero - pole) if seed != 2 else 1.0
+    assert f"of S below {blaschke:.4g}, of T below {blaschke:.4g}" in words[-1]
+    assert loop.S_peak >= blaschke * (1.0 - 1e-9)
+    assert blaschke * (1.0 - 1e-9) <= loop.T
+    assert len(words) == 1 + (seed != 2)
+
+
+def test_delay_and_an_unstable_pole_raise_the_least_peak() -> None:
+    """Of T it is at least e^(p τ) with all that comes later, as zeros in v."""
+    plant = StateSpace(*(np.array([[x]]) for x in (1.0, 1.0, 1.0, 0.0)))
+    bounds, T, tau = Bounds(3.0, 0.9, 1e-3), 0.05, 0.2
+    least = []
+    for delay in (0.0, tau):
+        (words,) = classic_limits(limits_of(plant, bounds, Sampling(1.0 / T, 1e6 * delay)))
+        least.append(float(words.split("of T below ")[1].split(",")[0]))
+    assert least[0] == pytest.approx(np.exp(T), rel=2e-3)  # a hold's own sample
+    assert least[1] == pytest.approx(np.exp(T + tau), rel=2e-3)
+
+
+def test_several_sensors_are_bounded_by_the_one_that_counts() -> None:
+    """The example's design ends at 94.9 Hz (its README)."""
+    problem = problem_of(load_case(ROOT / "examples" / "two_encoders" / "case.toml"))
+    found = gap_of(problem, (29.9, 25.0))
+    assert 94.9 < found.upper_bound / HZ < 130.0
+    assert found.lower_bound == 0.0

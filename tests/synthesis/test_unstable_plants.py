@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles.differences import difference
-from oracles.hard_plants import close
+from oracles.hard_plants import drawn_weights, far_from_sb10ad
 from oracles.helpers import control_weights, few, state_response, to_control
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.cross_check.backends import balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.kernels.certified_design import design
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.riccati import lqr_hamiltonian
@@ -21,7 +20,6 @@ from ccd_casadi.kernels.riccati_synthesis import central_controller
 from ccd_casadi.kernels.riccati_synthesis import synthesise as made
 from ccd_casadi.kernels.sensitivity import Column
 from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant, without_copies
-from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledChannel, ScaledPlant, scale_state_space
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
@@ -56,34 +54,13 @@ def drawn(
     B, C = np.linalg.solve(T, rng.normal(size=(n, p))), rng.normal(size=(p, n)) @ T
     system = StateSpace(np.linalg.solve(T, A @ T), B, C, np.zeros((p, p)))
     plant = scale_state_space(system, 1.0)
-    w0 = plant.omega_0
-    return plant, Weights(
-        M_S=rng.uniform(1.2, 3.0), A_S=10.0 ** rng.uniform(-3.0, -1.0),
-        omega_S=w0 * 10.0 ** rng.uniform(-1.5, 0.5), c_K=10.0 ** rng.uniform(1.0, 3.0),
-        omega_K=w0 * 10.0 ** rng.uniform(0.0, 1.5), M_K=1.0, A_l=rng.uniform(0.8, 1.5),
-        A_u=10.0 ** rng.uniform(-2.0, -0.5), omega_T=w0 * 10.0 ** rng.uniform(0.0, 1.5),
-        disturbance=10.0 ** rng.uniform(-1.0, 1.0) if disturbed else 0.0,
-    )  # fmt: skip
+    return plant, drawn_weights(rng, plant.omega_0, disturbed)
 
 
 def judged(seed: int, p: int, unstable: int, most: int, disturbed: bool = False) -> float:
     """The distance of γ_opt from SB10AD's; NaN where it is useless or the bound limits it."""
     plant, weights = drawn(seed, p, unstable, most, disturbed)
-    w0 = plant.omega_0
-    done = synthesise(plant, weights, omega_low=1e-2 * w0)
-    figures = done.figures
-    if figures.gamma_opt > 1e3:  # zeros beside unstable poles: rounding decides
-        return np.nan
-    assert figures.certificate.passed, figures.outcome
-    assert len(done.controller.A) == len(plant.A) + 3 * p  # as of a stable plant
-    standard, K = balance(mixed_sensitivity(plant, weights)), done.controller
-    norm = hinf_norm(close(standard, StateSpace(K.A / w0, K.B / w0, K.C, K.D)))[0]
-    assert norm <= figures.certificate.norm_bound * (1.0 + 1e-8)
-    if figures.limited_by_bound:  # which SB10AD decides by rounding
-        return np.nan
-    s = 1e3 / figures.gamma_opt  # it searches to absolute tolerances
-    standard = replace(standard, C1=s * standard.C1, D11=s * standard.D11, D12=s * standard.D12)
-    return abs(solve_slicot(standard).gamma_opt / 1e3 - 1.0)
+    return far_from_sb10ad(plant, plant, weights)
 
 
 @few(max_examples=12)

@@ -91,6 +91,7 @@ class SampledModel:
         """A, B and C at values of the parameters; `size`: not below their entries' sizes for
         parameters of these sizes."""
         modal, system = self.uncertain.modal(self.option), self.uncertain.options[self.option]
+        system.with_mass("[drive]")
         p = dict(zip(self.uncertain.names, values.tolist(), strict=True))
         n, one = len(modal.K), 1.0
         r, number = np.ones(n), {at: i + 1 for i, at in enumerate(modal.numbered)}

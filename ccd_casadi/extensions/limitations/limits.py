@@ -115,6 +115,7 @@ class Limits:
     `others`: one channel's, of other plants that the same controller serves.
     `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low.
     `beyond`: zeros of G in the right half plane, in v, which T has for every controller.
+    `unstable`: one channel's poles there, where S is 0 for every controller.
     `unbounded`: m_T where nothing bounds T, more than 1 + S_max.
     """
 
@@ -129,6 +130,7 @@ class Limits:
     ratio: float = 1.0
     integrator: bool = True
     others: tuple["Limits", ...] = ()
+    unstable: tuple[complex, ...] = ()
 
     def omega(self, v: Array) -> Array:
         """ω in rad/s."""
@@ -183,16 +185,12 @@ def limits_of(
     integrator: bool = True,
     outside: float = 1e-3,
 ) -> Limits:
-    """Of a SI plant, stable but for free bodies, in a direction of outputs (one output: None).
+    """Of a SI plant in a direction of outputs (one output: None).
 
-    `bounds` are its own. Free bodies make S vanish at rest; what is used here holds with them too.
-    A zero whose real part is `outside` of its size counts as one of the right half plane.
-
-    Raises PlantError where the plant is not stable.
+    `bounds` are its own. Free bodies and unstable poles make S vanish there; what is used here, T
+    analytic with zeros of G, holds with them too. A root whose real part is `outside` of its size
+    counts as one of the right half plane.
     """
-    poles = plant.poles
-    if not ((poles.real < 0.0) | _resting(poles)).all():
-        raise PlantError("no bound on every controller: the plant is not stable")
     if sampling is None:
         held, period = plant, 0.0
     else:
@@ -206,10 +204,10 @@ def limits_of(
     )
     row = tuple(part for part in parts if part is not None)
     one = plant.B.shape[1] == 1 and len(plant.C) == 1
-    zeros = row[0].zeros if one else np.empty(0, complex)
-    beyond = zeros[zeros.real > outside * np.abs(zeros)]
+    roots = (row[0].zeros, row[0].poles) if one else (np.empty(0, complex),) * 2
+    beyond, growing = (tuple(part[part.real > outside * np.abs(part)].tolist()) for part in roots)
     free = response_of(plant) if one and bounds.compliance_max is not None else None
-    return Limits(name, bounds, row, free, period, tuple(beyond.tolist()), ratio, integrator)
+    return Limits(name, bounds, row, free, period, beyond, ratio, integrator, unstable=growing)
 
 
 def discs(

@@ -28,6 +28,8 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.json_files import json_values
@@ -50,6 +52,8 @@ class BandwidthGap:
         That binds.
     plants : str
         In words.
+    limits : tuple of str
+        What unstable poles and zeros of the model do to every loop, in words.
     """
 
     upper_bound: float
@@ -57,6 +61,7 @@ class BandwidthGap:
     channel: str = ""
     plants: str = MODEL
     model_bound: float = 0.0
+    limits: tuple[str, ...] = ()
 
     def words(self, bandwidth: float) -> str:
         """Of the verdict, with a design's ω_b in rad/s."""
@@ -81,6 +86,7 @@ class BandwidthGap:
             "relative": self.upper_bound / bandwidth - 1.0,
             "channel": self.channel,
             "objective_bound": np.nan,
+            "limits": list(self.limits),
             "words": self.words(bandwidth) if np.isfinite(bandwidth) else "",
         }
         return json_values(found)
@@ -119,16 +125,73 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
                 found, channel = bound, limits.name
         return BandwidthGap(found, channel=channel)
     (model,) = loops
+    words = classic_limits(model)
+    if bounds_of(problem).error is not None:
+        return BandwidthGap(upper_bound(model), limits=words)
     pairs = opposite_corners(
         uncertain_plant(problem, theta), bounds_of(problem), structured_of(problem).sampling,
         integrator=model.integrator,
     )  # fmt: skip
     limits = forbids_most([model, *pairs])
-    gap = BandwidthGap(upper_bound(limits), plants="the set" if limits.others else MODEL)
+    on = "the set" if limits.others else MODEL
+    gap = BandwidthGap(upper_bound(limits), plants=on, limits=words)
     if not within:
         return gap
     most = upper_bound(model)
+    if model.unstable:  # a T that keeps the bounds need not be 1 at these poles
+        return replace(gap, model_bound=most)
     return replace(gap, model_bound=most, lower_bound=lower_bound(model, most))
+
+
+def of_counted_sensor(plant: StateSpace, bounds: Bounds, sampling: Sampling | None,
+                      integrator: bool) -> Limits:  # fmt: skip
+    """Of several sensors on one actuator, the loop of the one whose error counts.
+
+        1 - uᵀS r = uᵀG q,   q = K S r,   uᵀr = 1
+
+    Whatever the other sensors add, q is stable and |q| at most ‖KS‖ ‖r‖. S G has no bound here.
+    """
+    own = bounds.channels[bounds.error or 0]
+    C, B = np.array([own.output]) @ plant.C, plant.B * np.linalg.norm(own.reference)
+    bounds = replace(bounds.of_channel(bounds.error or 0), weights=bounds.weights,
+                     compliance_max=None)  # fmt: skip
+    one = strictly_proper(plant.A, B, C)
+    return limits_of(one, bounds, sampling, integrator=integrator)
+
+
+def classic_limits(limits: Limits) -> tuple[str, ...]:
+    """What holds for every controller of one channel, in words with figures; z and p in v.
+
+        S(z) = 1, S(p) = 0:   ‖S‖∞ >= Π_p |z + p̄|/|z - p|
+        T(p) = 1, T(z) = 0:   ‖T‖∞ >= Π_z |p + z̄|/|p - z|,   ‖S‖∞ >= ‖T‖∞ - 1
+
+    Hold and delay are zeros at 2/T. By Poisson's integral at a real p, with |T| <= 1 + S_max,
+    |T| is above 1/√2 somewhere from p tan(π/2 ln √2/(ln √2 + ln(1 + S_max))) on.
+    """
+    z, p = np.array(limits.beyond, complex), np.array(limits.unstable, complex)
+    S_max, period = limits.bounds.S_max, limits.period
+    words = []
+    for zero in z[(z.imag >= 0.0) & (np.abs(z) < 1.9 / period if period else True)]:
+        found = Zero(abs(zero) / HZ, -zero.real / abs(zero), 1.0)
+        words.append(
+            f"a zero in the right half plane at {number(abs(zero) / HZ, 3)} Hz: no bandwidth above "
+            f"{number(bandwidth_limit_hz(found, S_max), 3)} Hz within S_max"
+        )
+    if not len(p):
+        return tuple(words)
+    pairs = np.abs(z[:, None] + p.conj()) / np.abs(z[:, None] - p)
+    least_T = float(pairs.prod(axis=0).max())
+    least_S = max(float(pairs.prod(axis=1).max(initial=1.0)), least_T - 1.0)
+    share = np.log(2.0) / (np.log(2.0) + 2.0 * np.log(1.0 + S_max))
+    fastest = p[p.real.argmax()]
+    said = (
+        f"an unstable pole at {number(abs(fastest) / HZ, 3)} Hz: no controller has a peak of S "
+        f"below {number(least_S, 4)}, of T below {number(least_T, 4)}"
+    )
+    if fastest.imag == 0.0:
+        from_on = limits.omega(np.array(fastest.real * np.tan(0.5 * np.pi * share)))
+        said += f", and |T| exceeds 0.707 beyond {number(float(from_on) / HZ, 3)} Hz"
+    return (*words, said)
 
 
 def opposite_corners(
@@ -203,11 +266,11 @@ def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[
         raise UserError('gap: is known for controller.structure = "sections" alone')
     if problem.figure is not BANDWIDTH:
         raise UserError("gap: is known for the bandwidth alone; drop inner.minimise")
-    if structured_of(problem).bandwidth_of is not None:
-        raise UserError("gap: is known for one sensor for each actuator; drop bandwidth_of")
     uncertain, structure = uncertain_plant(problem, theta), structure_of(problem)
     plant = uncertain.plant(uncertain.nominal).plant_si()
     bounds, sampling = bounds_of(problem), structured_of(problem).sampling
+    if bounds.error is not None:
+        return [of_counted_sensor(plant, bounds, sampling, structure.integrator)]
     if not isinstance(structure, ChannelStructure):
         return [limits_of(plant, bounds, sampling, integrator=structure.integrator)]
     whole = bounds.weights  # a channel's own M_K bounds one direction of its forces alone
