@@ -140,7 +140,7 @@ def share_answer(found: ShareDesign) -> Answer:
     if not design.certified:
         words.insert(0, f"certified     failed: {design.words}")
     if not search.settled:
-        words.append("search        ended before a round of draws confirmed it")
+        words.append("search        ended before new draws accepted the design")
     own: dict[str, Any] = {}
     if whole is not None:
         own = {"theta": dict(zip(problem.names, found.whole_theta, strict=True)),
@@ -160,7 +160,7 @@ def share_answer(found: ShareDesign) -> Answer:
         **json_values(design_dict(problem, theta, design)),
         "whole_box": own or None,
         "search": {
-            "drawn": search.seen, "given_up": search.may_fail, "rounds": search.rounds,
+            "drawn": search.rounds * search.plan.draws, "rounds": search.rounds,
             "settled": search.settled,
             "set": [{"option": option, "point": list(point)} for option, point in scenarios],
         },
