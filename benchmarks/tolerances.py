@@ -35,7 +35,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.extensions.tolerances.answers import design_for_share, share_answer
 from ccd_casadi.extensions.tolerances.machines import Plan, drawn
-from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
+from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
 from ccd_casadi.extensions.tolerances.prices import prices, scaled
 from ccd_casadi.extensions.tolerances.share_certificate import certified_share
 from ccd_casadi.extensions.tolerances.widths import buy
@@ -68,7 +68,7 @@ def rib_stage_z(**robust: Any) -> Case:
 
 def with_sampler(case: Case, body: Callable[[Sampler], None], *, quiet: bool = True) -> None:
     """Call with a sampler of the whole box's problem, in this process."""
-    of = tolerances_of_case(case)
+    of = tolerance_case(case)
     with Workers(1) as workers, SampleStore(":memory:") as store:
         body(Sampler(of.problem, store, workers, quiet=quiet))
 
@@ -76,7 +76,7 @@ def with_sampler(case: Case, body: Callable[[Sampler], None], *, quiet: bool = T
 def share() -> None:
     """Design for 99.9 %, then 20 counts of fresh draws by the engine of the search."""
     case = rib_stage_z(**WIDE, share=0.999, distribution=dict.fromkeys(NAMES, "normal"))
-    of = tolerances_of_case(case)
+    of = tolerance_case(case)
 
     def body(sampler: Sampler) -> None:
         found = design_for_share(of, sampler, of.problem.start, 0, 120.0)

@@ -18,7 +18,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.extensions.tolerances import answers, widths
 from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, drawn
-from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
+from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
 from ccd_casadi.extensions.tolerances.prices import scaled
 from ccd_casadi.extensions.tolerances.share_certificate import (
     ShareCertificate,
@@ -182,7 +182,7 @@ def test_the_line_names_share_confidence_and_draws_and_claims_no_box(failed: int
 )
 def test_keys_without_effect_are_refused(tmp_path: Path, robust: str, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        tolerances_of_case(load_case(case_file(tmp_path, f"{ROBUST}{robust}\n")))
+        tolerance_case(load_case(case_file(tmp_path, f"{ROBUST}{robust}\n")))
 
 
 def test_what_cannot_keep_a_share_refuses_it_by_name(

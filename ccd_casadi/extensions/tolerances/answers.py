@@ -11,7 +11,8 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
 from ccd_casadi.codesign.result_entries import design_dict, sections_controller
 from ccd_casadi.codesign.run import within
-from ccd_casadi.extensions.tolerances.of_case import Tolerances
+from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
+from ccd_casadi.extensions.tolerances.tolerance_case import ToleranceCase
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, search_share
@@ -25,7 +26,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import remark
-from ccd_casadi.support.text import HZ, number
+from ccd_casadi.support.text import HZ, counted, number
 from ccd_casadi.support.time_budget import within_budget
 
 
@@ -73,13 +74,13 @@ class ShareDesign:
 
 
 def design_for_share(
-    of: Tolerances, sampler: Sampler, theta: tuple[float, ...] | None, seed: int, minutes: float
+    of: ToleranceCase, sampler: Sampler, theta: tuple[float, ...] | None, seed: int, minutes: float
 ) -> ShareDesign:
     """The whole box first, from there the share, then fresh draws.
 
     Parameters
     ----------
-    of : Tolerances
+    of : ToleranceCase
         With a plan.
     sampler : Sampler
         Of its problem.
@@ -151,7 +152,8 @@ def share_answer(found: ShareDesign) -> Answer:
         words.append(f"whole box     {figures}; the share has {gain:+z.1f} % of bandwidth")
     else:
         words.append("whole box     no controller was found for it")
-    scenarios = structured_of(problem).scenarios
+    kept = [{"option": option, "point": list(point)}
+            for option, point in structured_of(problem).scenarios]  # fmt: skip
     entry = {
         "status": "verified" if good else "not_verified",
         "verdict": {"share": line.entry},
@@ -162,12 +164,25 @@ def share_answer(found: ShareDesign) -> Answer:
         "search": {
             "drawn": search.rounds * search.plan.draws, "rounds": search.rounds,
             "settled": search.settled,
-            "set": [{"option": option, "point": list(point)} for option, point in scenarios],
+            "set": kept,
         },
     }  # fmt: skip
-    files = {} if design.controller is None else {
-        "controller.json": sections_controller(design, problem.sampling)
+    if design.controller is None:
+        return Answer(entry, tuple(words), good, {})
+    of_run = entry | {  # what `read_run` takes
+        "reason": "" if good else words[0], "anchors": [design.kappa.tolist()],
+        "robust": {"set": kept}, "seed": search.seed,
+        "verdict": {
+            "certified": VerdictLine.of(
+                State.PASSED if design.certified else State.FAILED,
+                (design.words or f"on the {counted(len(kept), 'machine')} that it is designed on",), {},
+            ).entry,
+            "survives": line.entry,
+            "deployable": deployable(None, problem.sampling).entry,
+        },
     }  # fmt: skip
+    files = {"controller.json": sections_controller(design, problem.sampling),
+             "result.json": of_run}  # fmt: skip
     return Answer(entry, tuple(words), good, files)
 
 

@@ -18,6 +18,7 @@ from scipy.special import bdtr, bdtrc, ndtr, ndtri
 from ccd_casadi.analysis.yield_bound import yield_bound
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 
 Machine = tuple[int, Array]  # option, point of the box
 
@@ -34,8 +35,8 @@ class MachineOptions:
         Fresh draws, over the least number that shows the share where none fails.
     reliable : float
         Probability that a search does not end with a design that its certificate refuses.
-    confirming : int
-        Rounds of the certificate's number of draws that accept a design, at least.
+    confirming, most : int
+        Rounds of the certificate's number of draws that accept a design, at least and at most.
     attempts : int
         Designs of a search that such rounds may judge.
     """
@@ -44,6 +45,7 @@ class MachineOptions:
     enough: float = 3.0
     reliable: float = 0.999
     confirming: int = 6
+    most: int = 64
     attempts: int = 8
 
 
@@ -147,10 +149,12 @@ class Plan:
         """
         q = np.minimum((1.0 - self.share) * np.geomspace(1e-3, 1e2, 2000), 1.0)
         refused = self.options.attempts * bdtrc(self.allowed, self.draws, q)
-        for rounds in count(self.options.confirming):
+        for rounds in range(self.options.confirming, self.options.most + 1):
             risk = [float((bdtr(c, rounds * self.draws, q) * refused).max())
                     for c in range(self.allowed * rounds)]  # fmt: skip
             good = sum(each <= 1.0 - self.options.reliable for each in risk)
             if good:
                 return Trial(rounds, good - 1)
-        raise AssertionError
+        words = "has no count of draws that accepts a design; give a share of 0.8 to 0.9999"
+        at = f"robust.share: {self.share!r} at a confidence of {self.confidence:g}"
+        raise UserError(f"{at} {words}, and a confidence of 0.5 to 0.999")
