@@ -25,8 +25,8 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     from ccd_casadi.cases.case import load_case, parse_theta, read_toml
     from ccd_casadi.extensions.drives.arithmetic import program_of
-    from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.drive_case import drive_problem
+    from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.sheet import entry, sheet_text
     from ccd_casadi.reporting.facts import run_name
     from ccd_casadi.support.errors import UserError

@@ -12,12 +12,13 @@ from ccd_casadi.codesign.formulations import formulation_of, usual_name
 from ccd_casadi.codesign.result_entries import design_dict, sections_controller
 from ccd_casadi.codesign.run import within
 from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
-from ccd_casadi.extensions.tolerances.tolerance_case import ToleranceCase
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, search_share
+from ccd_casadi.extensions.tolerances.tolerance_case import ToleranceCase
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
@@ -26,7 +27,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import remark
-from ccd_casadi.support.text import HZ, counted, number
+from ccd_casadi.support.text import HZ, number
 from ccd_casadi.support.time_budget import within_budget
 
 
@@ -170,12 +171,14 @@ def share_answer(found: ShareDesign) -> Answer:
     if design.controller is None:
         return Answer(entry, tuple(words), good, {})
     of_run = entry | {  # what `read_run` takes
+        "formulation": "share", "objective": objective(problem, theta, design.bandwidth),
+        "cost_unit": problem.cost_unit, "units": problem.parameter_units,
         "reason": "" if good else words[0], "anchors": [design.kappa.tolist()],
         "robust": {"set": kept}, "seed": search.seed,
         "verdict": {
             "certified": VerdictLine.of(
                 State.PASSED if design.certified else State.FAILED,
-                (design.words or f"on the {counted(len(kept), 'machine')} that it is designed on",), {},
+                (f"{design.words}, on which it was designed",), {},
             ).entry,
             "survives": line.entry,
             "deployable": deployable(None, problem.sampling).entry,
