@@ -103,9 +103,9 @@ def test_failures_are_counted_anew_for_each_design(monkeypatch: pytest.MonkeyPat
     def drawn_on(one: ShareSearch, _: object) -> tuple[ShareSearch, int]:
         return replace(one, rounds=one.rounds + 1), next(counts)
 
-    def redesigned(one: ShareSearch, *_: object, joins: int) -> ShareSearch:
+    def redesigned(one: ShareSearch, *_: object, fewer: int) -> ShareSearch:
         designs.append(one.rounds)
-        assert joins == 1
+        assert fewer == 1
         return one
 
     monkeypatch.setattr(ShareSearch, "with_draws", drawn_on)

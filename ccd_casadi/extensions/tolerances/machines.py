@@ -61,24 +61,7 @@ def drawn(
     number: int,
     options: MachineOptions = MachineOptions(),
 ) -> list[Machine]:
-    """Draw machines.
-
-    Parameters
-    ----------
-    uncertain : UncertainPlant
-        The box, with n parameters.
-    distribution : mapping
-        "uniform" or "normal" by tolerance; uniform where it has none.
-    rng : Generator
-    number : int
-        Of machines.
-    options : MachineOptions
-
-    Returns
-    -------
-    list of (int, (n,) array)
-        Options and points of the box.
-    """
+    """Draw options and points (n,) of the box; uniform where a tolerance has no distribution."""
     option = rng.integers(len(uncertain.options), size=number).tolist()
     unit = rng.random((number, len(uncertain.names)))
     points = np.empty_like(unit)

@@ -88,18 +88,7 @@ Judge = Callable[[list[Machine]], list[bool]]
 
 
 def judged(judge: Judge, machines: list[Machine]) -> tuple[int, int]:
-    """Count failing machines, and how many of these could not be evaluated.
-
-    Parameters
-    ----------
-    judge : callable
-        Which machines of a list keep every bound.
-    machines : list of Machine
-
-    Returns
-    -------
-    int, int
-    """
+    """Count failing machines, and how many of these could not be evaluated."""
     try:
         return sum(not kept for kept in judge(machines)), 0
     except Exception:  # a plant function may raise anything: each by itself, to find which

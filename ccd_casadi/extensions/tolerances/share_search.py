@@ -143,48 +143,47 @@ class ShareSearch:
         wider = replace(self, tail=(*self.tail, *nearest), rounds=self.rounds + 1)
         return wider, int((value > WorstPlantOptions.within).sum())
 
-    def failing(self) -> tuple[list[Scenario], Array]:
-        """The draws ranked again that exceed a bound, the worst first; and the value of each."""
+    def ranked(self) -> dict[Scenario, float]:
+        """The draws ranked again and their excesses, the worst first."""
         value = self.excesses(self.tail)
-        order = [
-            i for i in np.argsort(-value, kind="stable") if value[i] > WorstPlantOptions.within
-        ]
-        return [scenario_of(self.tail[i]) for i in order], value
+        order = np.argsort(-value, kind="stable")
+        return {scenario_of(self.tail[i]): float(value[i]) for i in order}
 
-    def redesigned(self, tell: Tell, options: ShareOptions, joins: int = 0) -> "ShareSearch":
+    def failing(self) -> list[Scenario]:
+        """Those of them that exceed a bound."""
+        return [one for one, value in self.ranked().items() if value > WorstPlantOptions.within]
+
+    def redesigned(self, tell: Tell, options: ShareOptions, fewer: int = 0) -> "ShareSearch":
         """With the machines that exceed a bound and are not given up, until there are none.
 
-        `joins`: as many at least, so that no rejected design is tried again.
+        `fewer`: by which the next design fails on at least, so that none is tried twice.
         """
         search, may = self, self.may_fail(options)
         for _ in range(options.designs):
             known = structured_of(search.problem).scenarios
-            over = [one for one in search.failing()[0] if one not in known]
-            given_up = max(min(may, len(over) - joins), 0)
-            added, joins = over[given_up:][: options.added], 0
+            over = [one for one in search.failing() if one not in known]
+            may, fewer = max(min(may, len(over) - fewer), 0) if fewer else may, 0
+            added = over[may:][: options.added]
             if not added or ends_early("design on drawn machines"):
                 break
             search = search.on((*known, *added))
             search.tell(tell, f"{counted(len(over), 'machine')} exceeded a bound, {may} may")
-        return search.relieved(tell, options)
+        return search.relieved(tell, options, may)
 
-    def relieved(self, tell: Tell, options: ShareOptions) -> "ShareSearch":
-        """Without the machine that binds most, again and again, as far as that many may fail: the
+    def relieved(self, tell: Tell, options: ShareOptions, may: int) -> "ShareSearch":
+        """Without the machine that costs most, again and again, while no more than may fail do: the
         set has machines that joined when fewer were given up."""
-        search, may = self, self.may_fail(options)
-        while len(search.failing()[0]) < may:
-            value = dict(zip(map(scenario_of, search.tail), search.failing()[1], strict=True))
-            known = structured_of(search.problem).scenarios
-            binding = [one for one in known if value.get(one, -np.inf) > -options.binds]
-            J = partial(objective_of, search.problem)
-            others = [search.on(tuple(each for each in known if each != one)) for one in binding]
-            for other in sorted(others, key=lambda one: J(one.best)):
-                gains = J(other.best) < J(search.best) - options.settled * abs(J(search.best))
-                if gains and len(other.failing()[0]) <= may:
-                    break
-            else:
+        search, J = self, partial(objective_of, self.problem)
+        while not ends_early("design without a machine"):
+            ranked, known = search.ranked(), structured_of(search.problem).scenarios
+            if sum(value > WorstPlantOptions.within for value in ranked.values()) >= may:
                 break
-            if ends_early("design without a machine"):
+            binding = [one for one in known if ranked.get(one, -np.inf) > -options.binds]
+            others = [search.on(tuple(each for each in known if each != one)) for one in binding]
+            least = J(search.best) - options.settled * abs(J(search.best))
+            better = sorted((J(one.best), i) for i, one in enumerate(others) if J(one.best) < least)
+            found = (others[i] for _, i in better if len(others[i].failing()) <= may)
+            if (other := next(found, None)) is None:
                 break
             search = other
             search.tell(tell, "one that binds was given up")
@@ -232,7 +231,7 @@ class ShareSearch:
                     return search
             if ends_early("round of drawn machines"):
                 break
-            search = search.redesigned(tell, options, joins=1)
+            search = search.redesigned(tell, options, fewer=1)
         return search
 
 
@@ -246,20 +245,10 @@ def begun(
     sampler: Sampler, theta: tuple[float, ...], kappa: Array | None, plan: Plan,
     distribution: Mapping[str, str], seed: int, tell: Tell,
 ) -> ShareSearch:  # fmt: skip
-    """Begin with the model of every option alone, from a controller of the whole box at θ.
+    """Begin with the model of every option alone.
 
-    Parameters
-    ----------
-    sampler : Sampler
-        Of the problem with the box, and with warm starts where there is a controller.
-    theta, kappa : tuple of float, array or None
-        Of the design for the whole box, SI; None where there is none: then the model's own.
-    plan, distribution, seed : Plan, mapping, int
-    tell : callable
-
-    Returns
-    -------
-    ShareSearch
+    From κ of the design for the whole box at θ (SI); None where there is none: then from the
+    model's own. `sampler` is of the problem with the box.
     """
     problem = sampler.problem
     if kappa is None:
