@@ -11,8 +11,8 @@ from pathlib import Path
 from time import perf_counter
 
 from ccd_casadi.cases.case import Case, parse_case, read_toml
+from ccd_casadi.extensions.drives.drive_case import drive_problem
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
-from ccd_casadi.extensions.drives.of_case import drive_problem
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 

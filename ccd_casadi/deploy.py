@@ -82,7 +82,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         raise UserError("--single, --fixed: the code has one precision; drop one of them")
     if options.fmu and (options.single or options.fixed):
         raise UserError("--fmu: is of double precision; drop it, or --single, --fixed")
-    finished = read_run(options.run)
+    finished = read_run(options.run, of_share=True)
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
         reason = finished.result.get("reason") or "no reason is given"

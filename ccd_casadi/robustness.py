@@ -39,7 +39,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 
-    finished = read_run(options.run)
+    finished = read_run(options.run, of_share=True)
     outputs = finished.plant.C.shape[0]
     if options.axis > 1 and (places := kind_of(finished.problem).bounds().places):
         words = f"is {options.axis}; of several sensors on one actuator that of {places[0].name}"

@@ -172,13 +172,18 @@ def _measured(
                    sensitivity_peak_frequency=own.sensitivity_peak_frequency)  # fmt: skip
 
 
-def read_run(folder: str | Path, *, options: RunFolderOptions = RunFolderOptions()) -> FinishedRun:
+def read_run(
+    folder: str | Path, *, of_share: bool = False, options: RunFolderOptions = RunFolderOptions()
+) -> FinishedRun:
     """Read a finished run, and certify its controller again.
 
     Parameters
     ----------
     folder : path
         With case.toml, result.json and controller.json.
+    of_share : bool
+        Whether it may be of a share of machines, which keeps the set that it was designed on and
+        not its box.
     options : RunFolderOptions
         Tolerances.
 
@@ -201,10 +206,14 @@ def read_run(folder: str | Path, *, options: RunFolderOptions = RunFolderOptions
         words = "the run found no feasible design; there is nothing to work on"
         raise UserError(f"{folder / 'result.json'}: status: {words}")
     case = load_case(folder / "case.toml")
-    problem = problem_of(case)
+    share = case.robust.share_words
+    if share and not of_share:
+        words = f"is {share}; name a run of the whole box, or use `ccd deploy` or `ccd robustness`"
+        raise UserError(f"{folder}: {words}")
+    problem = problem_of(replace(case, robust=replace(case.robust, share=None)))
     theta = theta_of(folder / "result.json", result, problem)
     if isinstance(problem.controller, StructuredProblem):
-        found = _read_structured(folder, problem, theta, result)
+        found = _read_structured(folder, problem, theta, result, of_share=bool(share))
     else:
         found = _read_mixed(folder, problem, theta, result, options)
     problem = found.pop("problem", problem)
@@ -282,9 +291,11 @@ def _read_mixed(
 
 
 def _read_structured(
-    folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The same and κ of a fixed structure: rebuilt from κ, judged on the corners of its set.
+    folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any],
+    *, of_share: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """The same and κ of a fixed structure: rebuilt from κ, judged on the corners of its set; for a
+    share on the machines that it was designed on.
 
     `figures` are those of the continuous loop with the model; hold and delay are not in them.
     """
@@ -293,11 +304,16 @@ def _read_structured(
     structure = structure_of(problem)
     kappa = np.array(sections_kappa(folder, structure))
     controller = structure.state_space(kappa)
-    judged = certify_corners(problem, theta, controller)
+    problem = with_function(folder / "result.json", problem, result)
+    kept = [(option, np.array(point)) for option, point in structured_of(problem).scenarios]
+    if of_share and not kept:
+        words = "robust.set: is missing; run `ccd tolerances` again"
+        raise UserError(f"{folder / 'result.json'}: {words}")
+    judged = certify_corners(problem, theta, controller, kept if of_share else ())
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa)
+    problem = with_warm_start(problem, kappa)
     figures = _measured(problem, scaled_plant(problem, theta), controller, problem.weights)
     return {"problem": problem, "weights": problem.weights, "controller": controller,
             "figures": figures, "kappa": kappa}  # fmt: skip

@@ -257,6 +257,14 @@ class RobustTable:
         check=checks.by_name(checks.interval),
     )
 
+    @property
+    def share_words(self) -> str:
+        """What a design for a share is for; empty of the whole box."""
+        if self.share is None:
+            return ""
+        sure = f"{100.0 * self.confidence:g} % confidence"
+        return f"for a share of {100.0 * self.share:g} % of machines at {sure}"
+
 
 @dataclass(frozen=True)
 class PlacesTable:

@@ -276,6 +276,20 @@ def resolved(case: Case, solution: Solution) -> Case:
     return replace(case, robust=replace(case.robust, design_at=problem.robust.design_at))
 
 
+def write_case(folder: Path, case: Case) -> None:
+    """Write case.toml of a run folder, and the plant's own code beside it.
+
+    Parameters
+    ----------
+    folder, case : Path, Case
+    """
+    write_whole(folder / "case.toml", case_to_toml(case))  # a kill must not leave half a case
+    function = case.plant.function
+    own = Path(function.rsplit(":", 1)[0] if isinstance(function, str) else "")
+    if own.is_file() and own.parent != folder.resolve():
+        write_whole(folder / own.name, own.read_bytes())  # for who gets the folder alone
+
+
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """Write what a run folder holds besides samples and report; clear an earlier run's.
 
@@ -292,12 +306,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)
-    text = case_to_toml(resolved(case, solution))
-    write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
-    function = case.plant.function
-    own = Path(function.rsplit(":", 1)[0] if isinstance(function, str) else "")
-    if own.is_file() and own.parent != folder.resolve():
-        write_whole(folder / own.name, own.read_bytes())  # for who gets the folder alone
+    write_case(folder, resolved(case, solution))
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

@@ -368,6 +368,8 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     """
     own = f"the run itself is not verified: {found.unverified}"
     parts = [own] if found.unverified else []
+    if share := run.case.robust.share_words:
+        parts.append(f"{share}: judged here on the {1 + len(found.members)} that it has kept alone")
     if found.shortfalls:
         return "; ".join([*parts, found.shortfalls[0]])
     S_max, over = run.problem.inner.S_max, _over(run, found)

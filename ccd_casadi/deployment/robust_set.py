@@ -128,8 +128,11 @@ def as_written(run: FinishedRun) -> list[StateSpace]:
 def _points(
     run: FinishedRun, uncertain: UncertainPlant, dense: bool, count: int = 41
 ) -> list[tuple[int, Array]]:
-    """Corners of the box, the run's own set, `dense`: a lattice of `count` plants too."""
+    """Corners of the box, the run's own set, `dense`: a lattice of `count` plants too; of a share
+    the set alone."""
     sections = structured_of(run.problem)
+    if run.case.robust.share is not None:
+        return [(i, np.array(p)) for i, p in sections.scenarios]
     points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
     return points + (lattice(uncertain, count, sections.seed) if dense else [])
 

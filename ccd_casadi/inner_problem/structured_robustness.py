@@ -352,21 +352,24 @@ def recertified(
 
 
 def certify_corners(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> SetCertificate:
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
+    points: Sequence[tuple[int, Array]] = (),
+) -> SetCertificate:  # fmt: skip
     """Judge a controller on the model of every option and on the corners of the box.
 
     Parameters
     ----------
     problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
         K(s) in SI.
+    points : sequence of (option, point)
+        The plants of the box that are judged in their place.
 
     Returns
     -------
     SetCertificate
     """
     uncertain = uncertain_plant(problem, theta)
-    plants = uncertain.as_written(uncertain.corners())
+    plants = uncertain.as_written(points or uncertain.corners())
     return _judged(problem, plants, controller, BoxCheckOptions.looseness)
 
 

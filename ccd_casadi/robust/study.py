@@ -285,7 +285,10 @@ def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
             "worst_stable": hard.worst.stable,
         },
     }  # fmt: skip
-    return VerdictLine.of(state, (*said, *clauses_of(before), tried), figures)
+    clauses = (*said, *clauses_of(before))
+    if run.case.robust.share is not None:  # what it is for comes first
+        clauses = (*clauses_of(before), *said)
+    return VerdictLine.of(state, (*clauses, tried), figures)
 
 
 def _disk(margin: DiskMargin) -> dict[str, float]:

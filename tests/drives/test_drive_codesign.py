@@ -9,9 +9,9 @@ from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.drive import main
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
 from ccd_casadi.extensions.drives.cascade_search import Search
+from ccd_casadi.extensions.drives.drive_case import DriveProblem, drive_problem
 from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, first_points, plants_at
-from ccd_casadi.extensions.drives.of_case import DriveProblem, drive_problem
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.plant import hardware_cost

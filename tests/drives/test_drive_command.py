@@ -9,7 +9,7 @@ import pytest
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drive import main
-from ccd_casadi.extensions.drives.of_case import drive_problem
+from ccd_casadi.extensions.drives.drive_case import drive_problem
 from ccd_casadi.support.errors import UserError
 
 EXAMPLE = Path(__file__).parents[2] / "examples/drive_bench/case.toml"

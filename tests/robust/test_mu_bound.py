@@ -46,6 +46,7 @@ def test_triangular_matrices_and_zeros_come_to_an_end() -> None:
 @pytest.mark.parametrize("n", [2, 3, 6])
 def test_it_is_a_few_per_cent_looser_than_slicots_at_most(n: int) -> None:
     import slycot
+
     M = drawn(8, n, seed=n)
     ones = np.ones(n, dtype=int)
     theirs = [slycot.ab13md(m, ones, 2 * ones)[0] for m in M]

@@ -15,19 +15,25 @@ from oracles.case_documents import QUICK_SECTIONS
 
 from ccd_casadi.cases.case import load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.deployment.robust_set import members
 from ccd_casadi.extensions.tolerances import answers, widths
-from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, drawn
-from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
+from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, Trial, drawn
 from ccd_casadi.extensions.tolerances.prices import scaled
 from ccd_casadi.extensions.tolerances.share_certificate import (
     ShareCertificate,
     certified_share,
     judged,
 )
+from ccd_casadi.extensions.tolerances.share_search import ShareOptions, ShareSearch
+from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, promised
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.insight import main as insight_main
+from ccd_casadi.report import main as report_main
+from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.tolerances import main
@@ -68,9 +74,45 @@ def test_what_may_fail_is_the_most_that_scipy_confirms(share: float, confidence:
         return float(found.proportion_ci(confidence).low)
 
     assert least(plan.allowed) >= share > least(plan.allowed + 1)
-    confirmed = scipy.stats.binom.cdf(plan.allowed, plan.draws, plan.given_up)
-    assert confirmed == pytest.approx(MachineOptions.reliable, abs=1e-9)
-    assert 0.0 < plan.given_up < 1.0 - share
+
+
+@pytest.mark.parametrize(("share", "confidence"), [(0.9, 0.9), (0.99, 0.99), (0.999, 0.99)])
+def test_the_trial_is_the_largest_count_that_keeps_its_chance(
+    share: float, confidence: float
+) -> None:
+    """Of any share q that fails: accepted by an attempt and then refused by the certificate."""
+    plan, binom = Plan(share, confidence), scipy.stats.binom
+    q = np.geomspace(1e-3, 1.0 / (1.0 - share), 5000)[:-1] * (1.0 - share)
+
+    def chance(allowed: int) -> float:
+        accepted = binom.cdf(allowed, plan.trial.rounds * plan.draws, q)
+        both = accepted * binom.sf(plan.allowed, plan.draws, q)
+        return float(MachineOptions.attempts * both.max())
+
+    most = 1.0 - MachineOptions.reliable
+    assert chance(plan.trial.allowed) <= most * (1.0 + 1e-4) < chance(plan.trial.allowed + 1)
+    assert plan.trial.rounds >= MachineOptions.confirming
+
+
+def test_failures_are_counted_anew_for_each_design(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A design is accepted by all rounds of its trial, with at most as many failures in all."""
+    counts = iter([3, 1, 1, 2, 0, 1, 1, 0])  # a design is refused at 3, at 4 and at 3
+    designs: list[int] = []
+    search = ShareSearch(None, None, Plan(0.999, 0.99), {}, 0)  # type: ignore[arg-type]
+
+    def drawn_on(one: ShareSearch, _: object) -> tuple[ShareSearch, int]:
+        return replace(one, rounds=one.rounds + 1), next(counts)
+
+    def redesigned(one: ShareSearch, *_: object, fewer: int) -> ShareSearch:
+        designs.append(one.rounds)
+        assert fewer == 1
+        return one
+
+    monkeypatch.setattr(ShareSearch, "with_draws", drawn_on)
+    monkeypatch.setattr(ShareSearch, "redesigned", redesigned)
+    found = search.at_its_theta(lambda _: None, ShareOptions(), Trial(3, 2), 8)
+    assert (designs, found.rounds, found.settled) == ([1, 4], 7, True)
+    assert not replace(found).at_its_theta(lambda _: None, ShareOptions(), Trial(2, -1), 1).settled
 
 
 @pytest.mark.parametrize("word", ["uniform", "normal"])
@@ -97,15 +139,18 @@ def test_drawn_machines_have_the_share_that_is_known(uncertain: Any, word: str) 
 
 
 def test_certificates_of_toys_claim_too_much_no_oftener_than_stated() -> None:
-    """Machines fail with a probability that the plan is to refuse in 99 of 100 cases, and with one
-    that it is to confirm."""
-    plan, toys, rng = Plan(0.99, 0.99), 1000, np.random.default_rng(2)
-    claimed = rng.binomial(plan.draws, 1.0 - plan.share, toys)
-    confirmed = rng.binomial(plan.draws, plan.given_up, toys)
+    """Machines fail with a probability that the plan is to refuse in 99 of 100 cases; and with one
+    that a trial may accept, of which the certificate refuses as few as stated."""
+    plan, toys, rng = Plan(0.99, 0.99), 200_000, np.random.default_rng(2)
+    trial, q = plan.trial, 0.01 * rng.random(toys)
+    claimed = rng.binomial(plan.draws, 1.0 - plan.share, 1000)
     wrong = sum(ShareCertificate(plan, int(failed)).passed for failed in claimed)
-    right = sum(ShareCertificate(plan, int(failed)).passed for failed in confirmed)
-    assert wrong <= toys * (1.0 - plan.confidence) + 4.0 * np.sqrt(toys * (1.0 - plan.confidence))
-    assert right >= toys * MachineOptions.reliable - 5.0
+    assert wrong <= 1000 * (1.0 - plan.confidence) + 4.0 * np.sqrt(1000 * (1.0 - plan.confidence))
+    accepted = rng.binomial(trial.rounds * plan.draws, q) <= trial.allowed
+    refused = accepted & (rng.binomial(plan.draws, q) > plan.allowed)
+    stated = toys * (1.0 - MachineOptions.reliable) / MachineOptions.attempts
+    assert refused.sum() <= stated + 4.0 * np.sqrt(stated)
+    assert accepted.sum() > 100
 
 
 # ---- the certificate -----------------------------------------------------------------------------
@@ -177,12 +222,20 @@ def test_the_line_names_share_confidence_and_draws_and_claims_no_box(failed: int
             "cost_per_percent = {gain = 1.0}\nhalf_width = {gain = [0.03, 0.1]}",
             "half_width.gain: is 0.03 to 0.1, without the case's own 0.02",
         ),
-        ("share = 1.0", "robust.share"),
+        ("share = 1.0", "robust.share: is 1; give a number between 0 and 1"),
+        ("share = -0.5", "robust.share: is -0.5; give a number between 0 and 1"),
+        ("share = 0.9\nconfidence = 0.01", "robust.share: 0.9 at a confidence of 0.01 has no"),
+        ('share = 0.9\ndistribution = "normal"', "robust.distribution: is 'normal'; give a table"),
+        ("cost_per_percent = {gain = -1.0}", "robust.cost_per_percent: gain is -1; give a number"),
+        (
+            "cost_per_percent = {gain = 1.0}\nhalf_width = {gain = [0.01, 5.0]}",
+            "half_width.gain: is 5; give a share of the gain, 0 to 0.9",
+        ),
     ],
 )
 def test_keys_without_effect_are_refused(tmp_path: Path, robust: str, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        tolerances_of_case(load_case(case_file(tmp_path, f"{ROBUST}{robust}\n")))
+        tolerance_case(load_case(case_file(tmp_path, f"{ROBUST}{robust}\n")))
 
 
 def test_what_cannot_keep_a_share_refuses_it_by_name(
@@ -300,4 +353,29 @@ def test_a_share_has_more_bandwidth_than_the_whole_box(
     assert (line["state"], line["share"], line["draws"]) == ("passed", 0.9, Plan(0.9, 0.9).draws)
     assert found["bandwidth_hz"] > found["whole_box"]["bandwidth_hz"]
     assert "whole box is not judged" in capsys.readouterr().out
-    assert json.loads((tmp_path / "case_tolerances" / "controller.json").read_text())["sections"]
+    _is_a_run_of_its_kept_set(tmp_path / "case_tolerances", capsys)
+
+
+def _is_a_run_of_its_kept_set(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What deploy and robustness read has the machines it was designed on, and no corner of the
+    box; other commands refuse it by name."""
+    run, whole = read_run(folder, of_share=True), 0.04
+    gains = [member.at.gain for member in members(run, dense=True)]  # type: ignore[attr-defined]
+    kept = [one["point"][0] for one in run.result["robust"]["set"]]
+    assert sorted(gains) == sorted(gain for gain in kept if gain)
+    assert max(map(abs, gains)) < whole
+    claim = "for a share of 90 % of machines at 90 % confidence"
+    assert run.result["verdict"]["survives"]["words"].startswith(claim)
+    for command in (insight_main, report_main):
+        assert command([str(folder)]) == 2
+        assert f"is {claim}; name a run of the whole box" in capsys.readouterr().err
+    assert robustness_main([str(folder), "--quiet", "--samples", "2"]) == 0
+    result = json.loads((folder / "result.json").read_text())
+    assert result["verdict"]["survives"]["words"].startswith(claim)
+    assert claim in " ".join((folder / "robustness.html").read_text().split())
+    corner = {"option": 0, "point": [whole]}
+    for kept_set, words in (([corner], "not certified on the plants"), ([], "set: is missing")):
+        result["robust"]["set"] = kept_set
+        (folder / "result.json").write_text(json.dumps(result))
+        with pytest.raises(UserError, match=words):
+            read_run(folder, of_share=True)

@@ -17,13 +17,13 @@ from scipy.optimize import Bounds as Box
 from scipy.optimize import NonlinearConstraint, minimize
 
 from ccd_casadi.extensions.drives.cascade_search import Candidate, Search
+from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_design import (
     NO_CASCADE,
     DriveOptions,
     first_points,
     plants_at,
 )
-from ccd_casadi.extensions.drives.of_case import DriveProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant

@@ -27,9 +27,9 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     from ccd_casadi.cases.case import load_case, parse_theta, read_toml
     from ccd_casadi.extensions.drives.arithmetic import program_of
+    from ccd_casadi.extensions.drives.drive_case import drive_problem
     from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
-    from ccd_casadi.extensions.drives.of_case import drive_problem
     from ccd_casadi.extensions.drives.sheet import (
         codesign_words,
         entry,

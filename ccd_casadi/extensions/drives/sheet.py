@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
-from ccd_casadi.extensions.drives.of_case import DriveProblem
 from ccd_casadi.support.text import HZ, number
 
 

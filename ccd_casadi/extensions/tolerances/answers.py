@@ -11,12 +11,14 @@ from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
 from ccd_casadi.codesign.result_entries import design_dict, sections_controller
 from ccd_casadi.codesign.run import within
-from ccd_casadi.extensions.tolerances.of_case import Tolerances
+from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
+from ccd_casadi.extensions.tolerances.tolerance_case import ToleranceCase
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
@@ -73,13 +75,13 @@ class ShareDesign:
 
 
 def design_for_share(
-    of: Tolerances, sampler: Sampler, theta: tuple[float, ...] | None, seed: int, minutes: float
+    of: ToleranceCase, sampler: Sampler, theta: tuple[float, ...] | None, seed: int, minutes: float
 ) -> ShareDesign:
     """The whole box first, from there the share, then fresh draws.
 
     Parameters
     ----------
-    of : Tolerances
+    of : ToleranceCase
         With a plan.
     sampler : Sampler
         Of its problem.
@@ -140,7 +142,7 @@ def share_answer(found: ShareDesign) -> Answer:
     if not design.certified:
         words.insert(0, f"certified     failed: {design.words}")
     if not search.settled:
-        words.append("search        ended before a round of draws confirmed it")
+        words.append("search        ended before new draws accepted the design")
     own: dict[str, Any] = {}
     if whole is not None:
         own = {"theta": dict(zip(problem.names, found.whole_theta, strict=True)),
@@ -151,7 +153,8 @@ def share_answer(found: ShareDesign) -> Answer:
         words.append(f"whole box     {figures}; the share has {gain:+z.1f} % of bandwidth")
     else:
         words.append("whole box     no controller was found for it")
-    scenarios = structured_of(problem).scenarios
+    kept = [{"option": option, "point": list(point)}
+            for option, point in structured_of(problem).scenarios]  # fmt: skip
     entry = {
         "status": "verified" if good else "not_verified",
         "verdict": {"share": line.entry},
@@ -160,14 +163,29 @@ def share_answer(found: ShareDesign) -> Answer:
         **json_values(design_dict(problem, theta, design)),
         "whole_box": own or None,
         "search": {
-            "drawn": search.seen, "given_up": search.may_fail, "rounds": search.rounds,
+            "drawn": search.rounds * search.plan.draws, "rounds": search.rounds,
             "settled": search.settled,
-            "set": [{"option": option, "point": list(point)} for option, point in scenarios],
+            "set": kept,
         },
     }  # fmt: skip
-    files = {} if design.controller is None else {
-        "controller.json": sections_controller(design, problem.sampling)
+    if design.controller is None:
+        return Answer(entry, tuple(words), good, {})
+    of_run = entry | {  # what `read_run` takes
+        "formulation": "share", "objective": objective(problem, theta, design.bandwidth),
+        "cost_unit": problem.cost_unit, "units": problem.parameter_units,
+        "reason": "" if good else words[0], "anchors": [design.kappa.tolist()],
+        "robust": {"set": kept}, "seed": search.seed,
+        "verdict": {
+            "certified": VerdictLine.of(
+                State.PASSED if design.certified else State.FAILED,
+                (f"{design.words}, on which it was designed",), {},
+            ).entry,
+            "survives": line.entry,
+            "deployable": deployable(None, problem.sampling).entry,
+        },
     }  # fmt: skip
+    files = {"controller.json": sections_controller(design, problem.sampling),
+             "result.json": of_run}  # fmt: skip
     return Answer(entry, tuple(words), good, files)
 
 

@@ -13,11 +13,12 @@ from itertools import count
 from math import ceil, log, log1p
 
 import numpy as np
-from scipy.special import betaincinv, ndtr, ndtri
+from scipy.special import bdtr, bdtrc, ndtr, ndtri
 
 from ccd_casadi.analysis.yield_bound import yield_bound
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 
 Machine = tuple[int, Array]  # option, point of the box
 
@@ -33,12 +34,19 @@ class MachineOptions:
     enough : float
         Fresh draws, over the least number that shows the share where none fails.
     reliable : float
-        Probability with which a design that the search accepts is to be confirmed.
+        Probability that a search does not end with a design that its certificate refuses.
+    confirming, most : int
+        Rounds of the certificate's number of draws that accept a design, at least and at most.
+    attempts : int
+        Designs of a search that such rounds may judge.
     """
 
     sigmas: float = 3.0
     enough: float = 3.0
     reliable: float = 0.999
+    confirming: int = 6
+    most: int = 64
+    attempts: int = 8
 
 
 def tolerance_of(name: str) -> str:
@@ -53,24 +61,7 @@ def drawn(
     number: int,
     options: MachineOptions = MachineOptions(),
 ) -> list[Machine]:
-    """Draw machines.
-
-    Parameters
-    ----------
-    uncertain : UncertainPlant
-        The box, with n parameters.
-    distribution : mapping
-        "uniform" or "normal" by tolerance; uniform where it has none.
-    rng : Generator
-    number : int
-        Of machines.
-    options : MachineOptions
-
-    Returns
-    -------
-    list of (int, (n,) array)
-        Options and points of the box.
-    """
+    """Draw options and points (n,) of the box; uniform where a tolerance has no distribution."""
     option = rng.integers(len(uncertain.options), size=number).tolist()
     unit = rng.random((number, len(uncertain.names)))
     points = np.empty_like(unit)
@@ -89,8 +80,16 @@ def drawn(
 
 
 @dataclass(frozen=True)
+class Trial:
+    """Fresh rounds of the certificate's number of draws, and the most failures in all of them."""
+
+    rounds: int
+    allowed: int
+
+
+@dataclass(frozen=True)
 class Plan:
-    """How many draws decide on a share at a confidence, and what the search may give up for it.
+    """How many draws decide on a share at a confidence, and what accepts a design before.
 
     Attributes
     ----------
@@ -117,10 +116,28 @@ class Plan:
         return next(m for m in count() if self.shown(m + 1) < self.share)
 
     @cached_property
-    def given_up(self) -> float:
-        """The largest share of failing machines q that the certificate confirms reliably.
+    def trial(self) -> Trial:
+        """What accepts a design: at most c failures in r fresh rounds of n = `draws` each.
 
-        P(at most `allowed` of `draws` fail | q) = I_{1-q}(draws - allowed, allowed + 1)
+        Of a design of which a share q fails, whatever q is,
+
+            accepted            A(q) = P(Bin(r n, q) <= c)
+            then refused        B(q) = P(Bin(n, q) > allowed), by draws independent of these
+            both                A(q) B(q) <= s = max over q of A B
+            any of `attempts`   at most attempts s <= 1 - reliable, by the sum
+
+        c is the largest that keeps this, for the least r from `confirming` on that has one. So
+        20 certificates of the design of a search all pass but for a chance of 20 (1 - reliable).
+        Failures are counted anew for each design: no design is accepted by draws that made it.
         """
-        others = self.draws - self.allowed, self.allowed + 1
-        return 1.0 - float(betaincinv(*others, self.options.reliable))
+        q = np.minimum((1.0 - self.share) * np.geomspace(1e-3, 1e2, 2000), 1.0)
+        refused = self.options.attempts * bdtrc(self.allowed, self.draws, q)
+        for rounds in range(self.options.confirming, self.options.most + 1):
+            risk = [float((bdtr(c, rounds * self.draws, q) * refused).max())
+                    for c in range(self.allowed * rounds)]  # fmt: skip
+            good = sum(each <= 1.0 - self.options.reliable for each in risk)
+            if good:
+                return Trial(rounds, good - 1)
+        words = "has no count of draws that accepts a design; give a share of 0.8 to 0.9999"
+        at = f"robust.share: {self.share!r} at a confidence of {self.confidence:g}"
+        raise UserError(f"{at} {words}, and a confidence of 0.5 to 0.999")

@@ -74,16 +74,7 @@ def tolerances_of(problem: CoDesignProblem) -> tuple[str, ...]:
 
 
 def scaled(problem: CoDesignProblem, name: str, factor: float) -> CoDesignProblem:
-    """Scale the width of one tolerance around the model; damping in its logarithm.
-
-    Parameters
-    ----------
-    problem, name, factor : CoDesignProblem, str, float
-
-    Returns
-    -------
-    CoDesignProblem
-    """
+    """Scale the width of one tolerance around the model; damping in its logarithm."""
     own: Uncertainty = structured_of(problem).uncertainty
     if name in SHARES:
         changed = replace(own, **{name: factor * getattr(own, name)})
@@ -117,19 +108,8 @@ def width_words(problem: CoDesignProblem, name: str) -> str:
 def redesigned(
     problem: CoDesignProblem, theta: Sequence[float], kappa: Array, workers: Pool | None = None
 ) -> tuple[CoDesignProblem, SectionsDesign]:
-    """The best from a controller at θ on the worst plants of the problem's own box.
-
-    Parameters
-    ----------
-    problem, theta, kappa : CoDesignProblem, sequence of float, array
-        SI.
-    workers : Pool, optional
-
-    Returns
-    -------
-    CoDesignProblem, SectionsDesign
-        The problem at θ with these plants, and the design.
-    """
+    """The best from a controller at θ on the worst plants of the problem's own box: the problem at
+    θ with these plants, and the design."""
     at = replace(problem, start=tuple(map(float, theta)))
     at = with_structured(at, warm_starts=(tuple(map(float, kappa)),), scenarios=())
     found, made, _ = prepared(at, silent, workers, only_warm_starts=True)

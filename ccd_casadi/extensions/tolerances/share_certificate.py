@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.cases.tables import RobustTable
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.extensions.tolerances.machines import Machine, Plan, drawn
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
@@ -18,7 +19,7 @@ from ccd_casadi.support.process_pool import Pool, results
 
 
 @dataclass(frozen=True)
-class CertificateOptions:
+class ShareCertificateOptions:
     """Numbers of the certificate.
 
     Attributes
@@ -65,12 +66,10 @@ class ShareCertificate:
     def line(self) -> VerdictLine:
         """Of the verdict. It says nothing of the whole box."""
         plan, state = self.plan, State.PASSED if self.passed else State.FAILED
-        percent, sure = f"{100.0 * plan.share:g} %", f"{100.0 * plan.confidence:g} % confidence"
-        judged = f"judged on {plan.draws:,} fresh draws"
+        claim = RobustTable(share=plan.share, confidence=plan.confidence).share_words
+        words = f"{claim}: " if self.passed else f"not shown {claim}: "
+        words += f"judged on {plan.draws:,} fresh draws, {self.failed} failed"
         least = f"{int(1e6 * self.least) / 1e4:g} % is shown"  # rounded down
-        words = f"{percent} of machines at {sure}: {judged}, {self.failed} failed"
-        if not self.passed:
-            words = f"{percent} of machines are not shown at {sure}: {judged}, {self.failed} failed"
         clauses = (words, least, f"{plan.allowed} may fail", "the whole box is not judged")
         return VerdictLine.of(state, clauses, self.entry)
 
@@ -89,18 +88,7 @@ Judge = Callable[[list[Machine]], list[bool]]
 
 
 def judged(judge: Judge, machines: list[Machine]) -> tuple[int, int]:
-    """Count failing machines, and how many of these could not be evaluated.
-
-    Parameters
-    ----------
-    judge : callable
-        Which machines of a list keep every bound.
-    machines : list of Machine
-
-    Returns
-    -------
-    int, int
-    """
+    """Count failing machines, and how many of these could not be evaluated."""
     try:
         return sum(not kept for kept in judge(machines)), 0
     except Exception:  # a plant function may raise anything: each by itself, to find which
@@ -112,7 +100,7 @@ def judged(judge: Judge, machines: list[Machine]) -> tuple[int, int]:
 
 def certified_share(
     on_box: DesignOnBox, plan: Plan, distribution: Mapping[str, str], seed: int,
-    workers: Pool | None = None, options: CertificateOptions = CertificateOptions(),
+    workers: Pool | None = None, options: ShareCertificateOptions = ShareCertificateOptions(),
 ) -> ShareCertificate:  # fmt: skip
     """Judge a design on fresh draws.
 
@@ -126,7 +114,7 @@ def certified_share(
         Of the run.
     workers : Pool, optional
         The result is the same for any number.
-    options : CertificateOptions
+    options : ShareCertificateOptions
 
     Returns
     -------

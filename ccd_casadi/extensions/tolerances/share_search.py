@@ -1,13 +1,14 @@
 """Search of a machine and controller whose bounds hold for a share of all machines.
 
-    max over (θ, κ) of -J  s.t.  every bound holds on all but K of N drawn machines,  K = floor(q N)
+    max over (θ, κ) of -J  s.t.  every bound holds on all but K of N drawn machines
 
 by constraint removal with re-ranking (Campi and Garatti 2011): on a working set of draws the
-design is that of the core, with its exact slopes; all draws are then ranked by their largest figure
+design is that of the core, with its exact slopes; the draws are then ranked by their largest figure
 over its bound; the K worst are given up, and those after them that exceed a bound join the set.
-Every round draws anew, until two rounds one after the other that no design has seen show no more
-than K in all: one alone is passed by luck too often. q is smaller than the share that may fail, so
-that the certificate confirms it reliably (`machines.Plan`).
+A design is accepted by new draws alone, of which only its own failures count: those of earlier
+designs say nothing of it, and the draws that made it flatter it. While θ moves one round accepts;
+the last design is accepted by all rounds of the plan's trial (`machines.Plan`). What fails there
+joins the set, and the search goes on.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ import numpy as np
 
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
-from ccd_casadi.extensions.tolerances.machines import Machine, Plan, drawn
+from ccd_casadi.extensions.tolerances.machines import Machine, Plan, Trial, drawn
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
@@ -48,15 +49,18 @@ class ShareOptions:
     Attributes
     ----------
     rounds : int
-        Of new draws at one θ, at most.
-    confirming : int
-        Of these, one after the other without a new design, that end it.
+        Of new draws at one θ while it moves, at most.
+    aimed : float
+        Failures that a design may have in the draws seen, over those that its trial allows in as
+        many: of fresh draws it has more.
     designs : int
         Between two rounds, at most.
     tail : int
         Draws of a round that are ranked again: those nearest to a bound.
     added : int
         Draws that join the working set at once.
+    binds : float
+        What a machine of the set that binds is within, of ln of a figure over its bound.
     moves : int
         Local solves over θ, each on the working set of the θ before.
     settled : float
@@ -66,10 +70,11 @@ class ShareOptions:
     """
 
     rounds: int = 12
-    confirming: int = 2
+    aimed: float = 0.5
     designs: int = 12
-    tail: int = 400
+    tail: int = 200
     added: int = 4
+    binds: float = 1e-3
     moves: int = 3
     settled: float = 1e-4
     seed: int = 4000
@@ -89,12 +94,10 @@ class ShareSearch:
         What is required, how tolerances are drawn, and the run's seed.
     tail : tuple of Machine
         Draws that are ranked again.
-    seen : int
-        How many were drawn.
     rounds : int
-        Of new draws.
+        Of new draws, each of the certificate's number.
     settled : bool
-        Whether the last rounds showed no more failing machines than are given up.
+        Whether new draws have accepted it.
     """
 
     sampler: Sampler
@@ -103,7 +106,6 @@ class ShareSearch:
     distribution: Mapping[str, str]
     seed: int
     tail: tuple[Machine, ...] = ()
-    seen: int = 0
     rounds: int = 0
     settled: bool = False
 
@@ -117,10 +119,9 @@ class ShareSearch:
         """With its controller and certificate on the working set."""
         return value_with_design(self.sampler, self.best).design
 
-    @property
-    def may_fail(self) -> int:
+    def may_fail(self, options: ShareOptions) -> int:
         """K: how many of the draws seen are given up."""
-        return int(self.plan.given_up * self.seen)
+        return int(options.aimed * self.plan.trial.allowed / self.plan.trial.rounds * self.rounds)
 
     def excesses(self, machines: "list[Machine] | tuple[Machine, ...]") -> Array:
         """ln of the largest figure over its bound (N,); infinite where it is not known."""
@@ -133,37 +134,65 @@ class ShareSearch:
         return np.where(np.isnan(found), np.inf, found)
 
     def with_draws(self, options: ShareOptions) -> tuple["ShareSearch", int]:
-        """After a round of new draws; how many machines fail in all."""
+        """After a round of new draws; how many machines of it fail."""
         rng = np.random.default_rng((self.seed, options.seed, self.rounds))
         uncertain = uncertain_plant(self.problem, self.best.theta)
         new = drawn(uncertain, self.distribution, rng, self.plan.draws)
         value = self.excesses(new)
         nearest = [new[i] for i in np.argsort(-value, kind="stable")[: options.tail]]
-        failing = int((value > WorstPlantOptions.within).sum())
-        if self.tail:
-            failing += int((self.excesses(self.tail) > WorstPlantOptions.within).sum())
-        wider = replace(self, tail=(*self.tail, *nearest), seen=self.seen + len(new),
-                        rounds=self.rounds + 1)  # fmt: skip
-        return wider, failing
+        wider = replace(self, tail=(*self.tail, *nearest), rounds=self.rounds + 1)
+        return wider, int((value > WorstPlantOptions.within).sum())
 
-    def redesigned(self, tell: Tell, options: ShareOptions) -> "ShareSearch":
-        """With the machines that exceed a bound and are not given up, until there are none."""
-        search = self
+    def ranked(self) -> dict[Scenario, float]:
+        """The draws ranked again and their excesses, the worst first."""
+        value = self.excesses(self.tail)
+        order = np.argsort(-value, kind="stable")
+        return {scenario_of(self.tail[i]): float(value[i]) for i in order}
+
+    def failing(self) -> list[Scenario]:
+        """Those of them that exceed a bound."""
+        return [one for one, value in self.ranked().items() if value > WorstPlantOptions.within]
+
+    def redesigned(self, tell: Tell, options: ShareOptions, fewer: int = 0) -> "ShareSearch":
+        """With the machines that exceed a bound and are not given up, until there are none.
+
+        `fewer`: by which the next design fails on at least, so that none is tried twice.
+        """
+        search, may = self, self.may_fail(options)
         for _ in range(options.designs):
-            value = search.excesses(search.tail)
-            order = np.argsort(-value, kind="stable")[search.may_fail :]
             known = structured_of(search.problem).scenarios
-            over = [scenario_of(search.tail[i]) for i in order
-                    if value[i] > WorstPlantOptions.within]  # fmt: skip
-            added = [one for one in over if one not in known][: options.added]
+            over = [one for one in search.failing() if one not in known]
+            may, fewer = max(min(may, len(over) - fewer), 0) if fewer else may, 0
+            added = over[may:][: options.added]
             if not added or ends_early("design on drawn machines"):
                 break
             search = search.on((*known, *added))
-            shown = search.problem.figure.shown(search.best.value)
-            tell(
-                f"{shown} on {counted(len(known) + len(added), 'machine')}, after {len(over)} more"
-            )
+            search.tell(tell, f"{counted(len(over), 'machine')} exceeded a bound, {may} may")
+        return search.relieved(tell, options, may)
+
+    def relieved(self, tell: Tell, options: ShareOptions, may: int) -> "ShareSearch":
+        """Without the machine that costs most, again and again, while no more than may fail do: the
+        set has machines that joined when fewer were given up."""
+        search, J = self, partial(objective_of, self.problem)
+        while not ends_early("design without a machine"):
+            ranked, known = search.ranked(), structured_of(search.problem).scenarios
+            if sum(value > WorstPlantOptions.within for value in ranked.values()) >= may:
+                break
+            binding = [one for one in known if ranked.get(one, -np.inf) > -options.binds]
+            others = [search.on(tuple(each for each in known if each != one)) for one in binding]
+            least = J(search.best) - options.settled * abs(J(search.best))
+            better = sorted((J(one.best), i) for i, one in enumerate(others) if J(one.best) < least)
+            found = (others[i] for _, i in better if len(others[i].failing()) <= may)
+            if (other := next(found, None)) is None:
+                break
+            search = other
+            search.tell(tell, "one that binds was given up")
         return search
+
+    def tell(self, tell: Tell, words: str) -> None:
+        """A line of progress."""
+        shown = self.problem.figure.shown(self.best.value)
+        tell(f"{shown} on {len(structured_of(self.problem).scenarios)} machines; {words}")
 
     def on(self, scenarios: tuple[Scenario, ...]) -> "ShareSearch":
         """The best from its own controller on another working set, at the same θ.
@@ -181,24 +210,28 @@ class ShareSearch:
         return replace(self, sampler=sampler, best=best)
 
     def at_its_theta(
-        self, tell: Tell, options: ShareOptions, beaten: float = np.inf
+        self, tell: Tell, options: ShareOptions, trial: Trial, designs: int
     ) -> "ShareSearch":
-        """Rounds of draws and designs at one θ, until rounds show no more failing machines than
-        are given up, or J is above that of a design which is `beaten`: it only rises."""
-        search, confirmed = replace(self, settled=False), 0
-        for _ in range(options.rounds):
-            search, failing = search.with_draws(options)
-            tell(f"{failing} of {search.seen} drawn machines fail, {search.may_fail} may")
-            confirmed = confirmed + 1 if failing <= search.may_fail else 0
-            if confirmed == options.confirming:
-                return replace(search, settled=True)
-            if confirmed:
-                continue
+        """Trials and designs at one θ, until new draws accept a design."""
+        search = replace(self, settled=False)
+        for _ in range(designs):
+            failing = 0
+            for number in range(1, trial.rounds + 1):
+                search, more = search.with_draws(options)
+                failing += more
+                tell(
+                    f"{failing} of {number * search.plan.draws} new machines fail; "
+                    f"{trial.allowed} of {trial.rounds * search.plan.draws} may"
+                )
+                if failing > trial.allowed:
+                    break
+                if number == trial.rounds:
+                    return replace(search, settled=True)
+                if ends_early("round of drawn machines"):
+                    return search
             if ends_early("round of drawn machines"):
                 break
-            search = search.redesigned(tell, options)
-            if objective_of(search.problem, search.best) > beaten:
-                break
+            search = search.redesigned(tell, options, fewer=1)
         return search
 
 
@@ -212,20 +245,10 @@ def started(
     sampler: Sampler, theta: tuple[float, ...], kappa: Array | None, plan: Plan,
     distribution: Mapping[str, str], seed: int, tell: Tell,
 ) -> ShareSearch:  # fmt: skip
-    """Begin with the model of every option alone, from a controller of the whole box at θ.
+    """Begin with the model of every option alone.
 
-    Parameters
-    ----------
-    sampler : Sampler
-        Of the problem with the box, and with warm starts where there is a controller.
-    theta, kappa : tuple of float, array or None
-        Of the design for the whole box, SI; None where there is none: then the model's own.
-    plan, distribution, seed : Plan, mapping, int
-    tell : callable
-
-    Returns
-    -------
-    ShareSearch
+    From κ of the design for the whole box at θ (SI); None where there is none: then from the
+    model's own. `sampler` is of the problem with the box.
     """
     problem = sampler.problem
     if kappa is None:
@@ -266,25 +289,32 @@ def search_share(
     Returns
     -------
     ShareSearch
-        The best that a round of draws has settled, or the last.
+        The best, settled where the plan's trial has accepted it.
     """
-    search = search.at_its_theta(tell, options)
+    trial = search.plan.trial
+    short = Trial(1, -(-trial.allowed // trial.rounds))
+
+    def screened(one: ShareSearch) -> ShareSearch:
+        return one.at_its_theta(tell, options, short, options.rounds)
+
     J = partial(objective_of, search.problem)
-    elsewhere = multistart_at(search.sampler, search.best)  # another controller may be better there
-    if J(elsewhere) < J(search.best) - options.settled * abs(J(search.best)):
-        best = search.sampler.value_from(search.best.theta, elsewhere.design.kappa.tolist())
-        other = replace(search, best=best).at_its_theta(tell, options, J(search.best))
-        search = min((search, other), key=lambda one: (not one.settled, J(one.best)))
+
+    def better(best: InnerSample) -> ShareSearch:
+        """From there, where that is better than from here, on the draws of both."""
+        if not J(best) < J(search.best) - options.settled * abs(J(search.best)):
+            return search
+        there = screened(replace(search, best=best))
+        here = replace(search, tail=there.tail, rounds=there.rounds).redesigned(tell, options)
+        return min((here, there), key=lambda one: J(one.best))
+
+    search = screened(search)
+    elsewhere = multistart_at(search.sampler, search.best).design.kappa.tolist()
+    search = better(search.sampler.value_from(search.best.theta, elsewhere))
     for _ in range(options.moves if moves else 0):
+        before = search.best.theta
         if ends_early("move of theta"):
             break
-        moved = pieces_from(search.sampler, search.best, options.settled)
-        before = J(search.best)
-        if not J(moved) < before - options.settled * abs(before):
+        search = better(pieces_from(search.sampler, search.best, options.settled))
+        if search.best.theta == before:
             break
-        other = replace(search, best=moved).at_its_theta(tell, options, before)
-        better = J(other.best) < before - options.settled * abs(before)
-        if not (better and other.settled >= search.settled):
-            break
-        search = other
-    return search
+    return search.at_its_theta(tell, options, trial, search.plan.options.attempts)

@@ -1,6 +1,6 @@
 """`python -m ccd_casadi.tolerances PLACE`: a design for a share of machines, or prices of a run.
 
-Writes tolerances.json; for a share controller.json too, for prices of half-widths a case file.
+Writes tolerances.json; for a share the files of a run too, for prices of half-widths a case file.
 """
 
 import argparse
@@ -24,12 +24,13 @@ def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case, parse_theta
     from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.result import write_case
     from ccd_casadi.extensions.tolerances.answers import (
         design_for_share,
         price_answer,
         share_answer,
     )
-    from ccd_casadi.extensions.tolerances.of_case import tolerances_of_case
+    from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.errors import UserError
@@ -42,11 +43,11 @@ def main(options: argparse.Namespace) -> ExitCode:
     if place.is_dir():
         if options.theta is not None or options.budget is not None:
             raise UserError(f"{place}: a run has its own theta; leave out --theta and --budget")
-        of = tolerances_of_case(load_case(place / "case.toml"))
+        of = tolerance_case(load_case(place / "case.toml"))
         run = read_run(place)
         folder = run_folder(place, options.out or place)
     else:
-        of = tolerances_of_case(load_case(place))
+        of = tolerance_case(load_case(place))
         if of.plan is None:
             words = "is missing; give it, or name the folder of a finished solve for its prices"
             raise UserError(f"{place}: robust.share: {words}")
@@ -64,6 +65,8 @@ def main(options: argparse.Namespace) -> ExitCode:
             answer = share_answer(design_for_share(of, sampler, theta, options.seed, minutes))
         else:
             answer = price_answer(run, sampler, options.quiet)
+    for name in () if run else ("result.json", "controller.json"):  # of an earlier one
+        (folder / name).unlink(missing_ok=True)
     reported = {"seed": options.seed, "seconds": options.seconds(), "versions": versions()}
     write_json(folder / "tolerances.json", answer.entry | reported)
     for name, content in answer.files.items():
@@ -71,6 +74,8 @@ def main(options: argparse.Namespace) -> ExitCode:
             (folder / name).write_text(content, "utf-8")
         else:
             write_json(folder / name, content)
+    if "result.json" in answer.files:
+        write_case(folder, of.case)
     inform("\n".join((*answer.words, f"file          {folder / 'tolerances.json'}")))
     if answer.good:
         return ExitCode.DONE

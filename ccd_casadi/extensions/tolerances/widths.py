@@ -96,23 +96,8 @@ def bought(
     sampler: Sampler, widths: Mapping[str, float], costs: Mapping[str, float], near: Bought,
     options: WidthOptions = WidthOptions(),
 ) -> Bought | None:  # fmt: skip
-    """The best machine and controller near another one, with these half-widths.
-
-    Parameters
-    ----------
-    sampler : Sampler
-        Of the case's problem.
-    widths, costs : mapping
-        Shares; per percent.
-    near : Bought
-        Where θ and controller begin.
-    options : WidthOptions
-
-    Returns
-    -------
-    Bought or None
-        None where no controller is certified.
-    """
+    """The best machine and controller near another one, with these half-widths (shares) and costs
+    (per percent); None where no controller is certified."""
     case, problem = structured_of(sampler.problem).uncertainty, sampler.problem
     changed: dict[str, Any] = dict(widths)
     wide = with_structured(problem, uncertainty=replace(case, **changed))

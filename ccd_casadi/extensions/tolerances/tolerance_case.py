@@ -15,7 +15,7 @@ from ccd_casadi.support.errors import UserError
 
 
 @dataclass(frozen=True)
-class Tolerances:
+class ToleranceCase:
     """A case with the problem of its whole box.
 
     Attributes
@@ -33,7 +33,7 @@ class Tolerances:
     distribution: Mapping[str, str]
 
 
-def tolerances_of_case(case: Case) -> Tolerances:
+def tolerance_case(case: Case) -> ToleranceCase:
     """Check what a case says of its tolerances.
 
     Parameters
@@ -42,7 +42,7 @@ def tolerances_of_case(case: Case) -> Tolerances:
 
     Returns
     -------
-    Tolerances
+    ToleranceCase
 
     Raises
     ------
@@ -82,8 +82,12 @@ def tolerances_of_case(case: Case) -> Tolerances:
         if not low <= own <= high:
             words = f"is {low:g} to {high:g}, without the case's own {own:g}; widen it"
             raise fail(f"half_width.{name}", words)
+        if wrong := type(table).__dataclass_fields__[name].metadata["check"](high):
+            raise fail(f"half_width.{name}", wrong)
     plan = None if table.share is None else Plan(table.share, table.confidence)
-    return Tolerances(case, problem, plan, table.distribution or {})
+    if plan is not None:
+        plan.trial  # noqa: B018  raises where none exists, before anything is searched
+    return ToleranceCase(case, problem, plan, table.distribution or {})
 
 
 def _require_known(
