@@ -1,7 +1,10 @@
 """Plants of first order: the person's own matrices, mechanics, differences, SB10AD, refusals."""
 
+import inspect
+import json
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -13,6 +16,7 @@ from oracles.hard_plants import drawn_weights, far_from_sb10ad
 from oracles.helpers import few
 from scipy.linalg import block_diag
 
+from ccd_casadi import inner
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Filters, Wiring
@@ -257,3 +261,21 @@ def test_an_undamped_pair_is_refused_by_its_frequency() -> None:
     system = mechanics(model_of(A=np.array([[0.0, 62.8318], [-62.8318, 0.0]])), (0.5,))
     with pytest.raises(PlantError, match="mode at 10 Hz is not damped"):
         require_damping(modal_plant(system, FREE))
+
+
+@pytest.mark.slow
+def test_a_case_of_first_order_has_the_controller_of_the_same_mechanics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped = Path(__file__).resolve().parents[2] / "runs" / "two_mass_built.toml"
+    head = "from typing import Any, Mapping\nimport casadi as ca\n"
+    head += "from ccd_casadi.plants.registry import two_mass\n"
+    (tmp_path / "plant.py").write_text(head + inspect.getsource(as_first_order))
+    text, case = shipped.read_text(), tmp_path / "case.toml"
+    case.write_text(text.replace('model = "two_mass"', 'function = "plant.py:as_first_order"'))
+    found = []
+    for path in (shipped, case):
+        assert inner.main([str(path), "--theta", "m1=55,m2=55"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[1]["status"] == "verified"
+    assert found[1]["bandwidth_hz"] == pytest.approx(found[0]["bandwidth_hz"], rel=0.02)
