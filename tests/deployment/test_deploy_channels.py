@@ -139,7 +139,7 @@ def test_what_runs_are_the_channels_sections_by_tustin(
 def test_both_ends_of_a_stroke_are_deployed_and_judged() -> None:
     case = load_case(EXAMPLES / "gantry_stroke" / "case.toml")
     problem = with_range(problem_of(case))
-    run: Any = SimpleNamespace(problem=problem, theta=problem.start)
+    run: Any = SimpleNamespace(problem=problem, theta=problem.start, case=case)
     places = {place for item in members(run) for place in item.at.varies}  # type: ignore[attr-defined]
     assert places == {("theta.at", -0.3), ("theta.at", 0.3)}
     assert len(as_written(run)) > len(members(run, dense=True)) > len(places)

@@ -14,6 +14,7 @@ from ccd_casadi import reporting
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.tables import RobustTable
 from ccd_casadi.codesign.formulation import FormulationRound
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.deployment.outcome import against, deployed_line
@@ -300,7 +301,8 @@ def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
         shortfalls=(), levels=(), unverified="", judge=None, rounding=None,
         target=SimpleNamespace(excess=0.05),
     )  # fmt: skip
-    run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)))
+    run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)),
+                          case=SimpleNamespace(robust=RobustTable()))  # fmt: skip
     words = f"{'; '.join(deployed_line(run, found).clauses)};"
     assert "on the model bandwidth 48.2 Hz, peak of S 1.64;" in words
     assert "(resonances +3 %) bandwidth 48.4 Hz, peak of S 1.72" in words
