@@ -244,7 +244,7 @@ class DriveTable:
     )
     velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
     position_rate_hz: float | None = key(
-        "rate of the position loop, a whole part of loop.rate_hz; absent: that rate",
+        "rate of a slower position loop",
         None,
         unit="Hz",
         check=checks.number(0.0, 1e9, "give more than 0"),
