@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.survival import PEAK, LoopsOffModel, Survival, excess_of, highest, survival
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import (

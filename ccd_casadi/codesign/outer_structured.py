@@ -32,7 +32,8 @@ from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated

@@ -9,12 +9,12 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import compliance_of, loop_entry
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.budget import BudgetFigures, SourceFigures
+from ccd_casadi.budget.evaluation import BudgetFigures, SourceFigures
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import BINDS, BrokenAt, key_words, kind_and_channel
-from ccd_casadi.fixed_structure.certificate import JudgeOptions
+from ccd_casadi.fixed_structure.bounds import BINDS, Bounds, BrokenAt, key_words, kind_and_channel
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget
@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler

@@ -19,8 +19,8 @@ from ccd_casadi.codesign.result_entries import (
 )
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.design import DesignOptions
+from ccd_casadi.fixed_structure.certificate import SetCertificate
+from ccd_casadi.fixed_structure.design import DesignOptions, SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.fixed_structure.worst_plant import Excess

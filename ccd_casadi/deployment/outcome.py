@@ -16,8 +16,8 @@ from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import LoopChannel, Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.judgement import Judgement
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.loop import Sampling

@@ -42,10 +42,10 @@ from ccd_casadi.deployment.reduction import (
 )
 from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
 from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
 from ccd_casadi.lti.loop import Sampling, sampled

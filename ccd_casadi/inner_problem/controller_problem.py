@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.budget.sources import ErrorBudget
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.text import HZ, spoken, with_unit

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
-from ccd_casadi.budget import BudgetFigures, evaluate_budget
-from ccd_casadi.budget.evaluation import variances
-from ccd_casadi.fixed_structure import Bounds, ShapeEnd
+from ccd_casadi.budget.evaluation import BudgetFigures, evaluate_budget, variances
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner, with_ports
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value

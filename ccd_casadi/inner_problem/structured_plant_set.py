@@ -9,8 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Structure
-from ccd_casadi.fixed_structure.bounds import ChannelBounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     channel_bounds,
@@ -21,6 +20,7 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant

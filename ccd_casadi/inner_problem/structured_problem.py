@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar, Self
 
-from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.budget.sources import ErrorBudget
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
     FIGURES,
@@ -22,6 +23,7 @@ from ccd_casadi.inner_problem.controller_problem import (
     FigureOfMerit,
     Options,
 )
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights

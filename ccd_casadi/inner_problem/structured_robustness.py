@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.certificate import JudgeOptions
-from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
+from ccd_casadi.fixed_structure.design import SectionsDesign, SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     Excess,

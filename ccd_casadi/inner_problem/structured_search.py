@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
 from ccd_casadi.fixed_structure.local_search import OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import Excess

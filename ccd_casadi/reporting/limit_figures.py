@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
-from ccd_casadi.budget import BudgetFigures
+from ccd_casadi.budget.evaluation import BudgetFigures
 from ccd_casadi.drawing.content import (
     Block,
     Chapter,

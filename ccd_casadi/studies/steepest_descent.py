@@ -18,7 +18,7 @@ from ccd_casadi.codesign.result_entries import active_of, box_words, design_dict
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verdict import VerdictLine, survives
 from ccd_casadi.codesign.verified_mixed import robust_words
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import final_design, hardware_at, objective

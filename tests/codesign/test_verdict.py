@@ -31,7 +31,7 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import multistart_words
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
-from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RobustSet
 from ccd_casadi.inner_problem.objective import TrueQuantities

@@ -31,9 +31,10 @@ from ccd_casadi.extensions.limitations.gap_command import main as gap_main
 from ccd_casadi.extensions.limitations.limits import discs
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
 from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners
-from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value

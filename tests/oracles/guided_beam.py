@@ -22,7 +22,7 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import synthesise_sections
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of

@@ -25,7 +25,7 @@ from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of

@@ -18,8 +18,8 @@ from ccd_casadi.analysis.loop_warnings import light_roots, ringing, second_cross
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.lti.loop import Loop, tustin
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Loop, Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.closed_loop import classical_margins
 

@@ -17,12 +17,11 @@ from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
 from ccd_casadi.extensions.explorer.designs import Look, Standing
 from ccd_casadi.extensions.explorer.notch import Notched
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.frequency_grid import frequency_grid
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.gain_figures import gain_panels

@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verdict import VerdictOptions
 from ccd_casadi.extensions.explorer.knobs import Knobs
-from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (

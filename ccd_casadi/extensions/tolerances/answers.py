@@ -16,7 +16,7 @@ from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, search_share
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.extensions.tolerances.machines import tolerance_of
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,

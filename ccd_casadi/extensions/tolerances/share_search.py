@@ -19,7 +19,7 @@ import numpy as np
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.extensions.tolerances.machines import Machine, Plan, drawn
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
