@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,8 +28,6 @@ from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import distinct
-from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -42,6 +41,9 @@ from ccd_casadi.support.text import counted
 from ccd_casadi.support.time_budget import ends_early, time_is_up
 from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.post_optimal import PostOptimal
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,7 @@ class Outer(ABC):
         return np.array(theta)
 
     @abstractmethod
-    def responses(self, x: Array) -> PostOptimal:
+    def responses(self, x: Array) -> "PostOptimal":
         """Derivatives of an optimum at x to the data of the problem (post-optimal sensitivity)."""
 
 
@@ -274,6 +276,8 @@ class ThetaOuter(Outer, ABC):
         with sampler.spent.on("polish"):
             best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, self.options.settled)
+        from ccd_casadi.codesign.theta_kkt import theta_kkt
+
         kkt = theta_kkt(problem, best, sampler)
         return PolishedDesign(
             np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan
@@ -289,10 +293,12 @@ class ThetaOuter(Outer, ABC):
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
+        from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
+
         stationary = theta_kkt(problem, best).stationarity <= ThetaKktOptions().smooth
         return Place(np.array(best.theta), J, stationary)
 
-    def responses(self, x: Array) -> PostOptimal:
+    def responses(self, x: Array) -> "PostOptimal":
         raise UserError("insight has no derivatives of an optimum of this kind of controller")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.result_entries import bound_words
+from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost

@@ -10,11 +10,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
@@ -40,6 +39,9 @@ from ccd_casadi.support.text import versions
 from ccd_casadi.support.time_budget import TimeBudget
 from surrogates import Quality, save
 from surrogates.files import write_whole
+
+if TYPE_CHECKING:
+    from ccd_casadi.cases.run_folder import FinishedRun
 
 FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or changes its meaning
 
@@ -219,7 +221,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine) -> FinishedRun:
+def with_verdict_line(run: "FinishedRun", out: Path, name: str, line: VerdictLine) -> "FinishedRun":
     """Replace a line of a run's verdict, and write it if `out` is within the run's folder.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
@@ -239,6 +241,8 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
     FinishedRun
         With the line in its result.
     """
+    from ccd_casadi.cases.run_folder import read_json
+
     folder, before = run.folder.resolve(), at_solve(run.result, name)
     if not before or not out.resolve().is_relative_to(folder):
         return run

@@ -47,7 +47,8 @@ from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation

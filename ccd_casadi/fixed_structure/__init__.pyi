@@ -11,4 +11,3 @@ from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
 from ccd_casadi.fixed_structure.structure import Structure as Structure
 from ccd_casadi.lti.loop import Sampling as Sampling
-from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise

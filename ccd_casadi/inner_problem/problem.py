@@ -447,3 +447,21 @@ def box(problem: CoDesignProblem) -> Box:
         In SI.
     """
     return Box(np.array(problem.lower), np.array(problem.upper))
+
+
+def with_options(
+    problem: CoDesignProblem, options: Sequence[tuple[str, object]]
+) -> CoDesignProblem:
+    """Replace some options of a problem's plant.
+
+    Parameters
+    ----------
+    problem, options : CoDesignProblem, sequence of (str, object)
+
+    Returns
+    -------
+    CoDesignProblem
+    """
+    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
+    source: PlantSource = replace(problem.source, options=merged)
+    return replace(problem, source=source)

@@ -23,11 +23,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
-    structured_of,
     uncertain_plant,
     warm_starts_at,
-    with_structured,
 )
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import SectionWords
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.reporting.facts import binding, gain_words, paragraph
 from ccd_casadi.support.text import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure

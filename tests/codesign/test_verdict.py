@@ -24,8 +24,8 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.result_entries import kept_words, robust_dict
 from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.structured_entries import kept_words, robust_dict
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import multistart_words

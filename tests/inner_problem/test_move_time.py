@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace

@@ -24,13 +24,13 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import (
+    StructuredProblem,
+    Uncertainty,
     structured_of,
-    uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 from ccd_casadi.inner_problem.structured_robustness import (
     BoxCheckOptions,
     DesignOnBox,

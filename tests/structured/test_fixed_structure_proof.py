@@ -9,7 +9,7 @@ import pytest
 from oracles.fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
 from oracles.helpers import HZ, two_mass_model
 
-from ccd_casadi.codesign.result_entries import bound_words
+from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome, prove

@@ -25,7 +25,8 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     scaled_system,
 )
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds

@@ -9,8 +9,8 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
-from ccd_casadi.codesign.result_entries import design_dict, sections_controller
 from ccd_casadi.codesign.run import within
+from ccd_casadi.codesign.structured_entries import design_dict, sections_controller
 from ccd_casadi.extensions.tolerances.of_case import Tolerances
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
@@ -18,7 +18,7 @@ from ccd_casadi.extensions.tolerances.share_search import ShareSearch, begun, se
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.plants.plant import hardware_cost

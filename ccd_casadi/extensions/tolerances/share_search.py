@@ -23,14 +23,13 @@ from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import (
+    Scenario,
+    Uncertainty,
     structured_of,
-    uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario, Uncertainty
 from ccd_casadi.inner_problem.structured_search import prepared, with_warm_start
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
