@@ -152,11 +152,11 @@ def of_budget(
         With `time_budget` and `phase_seconds` in its result.
     """
     own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
-    result, words = {**solution.result, **own}, spent.words
+    result, words = {**solution.result, **own}, "; ".join(spent.clauses)
     if words and "verdict" in result:
         line = result["verdict"]["optimal"]
         figures = {key: v for key, v in line.items() if key not in ("state", "words", "details")}
-        own_line = VerdictLine.of(State.UNKNOWN, (*words.split("; "), *clauses_of(line)), figures)
+        own_line = VerdictLine.of(State.UNKNOWN, (*spent.clauses, *clauses_of(line)), figures)
         verdict = result["verdict"] = {**result["verdict"], "optimal": own_line.entry}
         unknown = dict.fromkeys(("inner_optimum", "optimality"))
         checks = result["checks"] = {**result["checks"], **unknown}

@@ -248,7 +248,7 @@ class VerifiedStructured(Verified):
         judged = self.design.certificate
         figures = {} if judged is None else {"figures_over_bounds": judged.worst}
         if not self.certified:
-            return VerdictLine.of(State.FAILED, self.design.words.split("; "), figures)
+            return VerdictLine.of(State.FAILED, (self.design.words,), figures)
         if not self.feasible:
             words = "certified, but a constraint on theta is not met"
             return VerdictLine.of(State.FAILED, (words,), figures)

@@ -253,7 +253,7 @@ def deployed_line(
                 f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
             )
     ends = limit_words(figures["move"] or {})
-    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends))]
+    reasons = [*filter(None, (*reason_clauses(run, found), *found.levels, ends))]
     if found.rounding is not None:
         kept.append(rounding_words(found.rounding))
     if reasons:
@@ -366,10 +366,15 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     str
         Empty where there is nothing to say.
     """
+    return "; ".join(reason_clauses(run, found))
+
+
+def reason_clauses(run: FinishedRun, found: Deployment) -> list[str]:
+    """The same, a clause each."""
     own = f"the run itself is not verified: {found.unverified}"
     parts = [own] if found.unverified else []
     if found.shortfalls:
-        return "; ".join([*parts, found.shortfalls[0]])
+        return [*parts, found.shortfalls[0]]
     S_max, over = run.problem.inner.S_max, _over(run, found)
     where = f" ({place_words(found.worst.at)})" if found.members else ""
     if over > 0.0:
@@ -378,4 +383,4 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
             f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
             f"a deployment may exceed it by {allowed:.2g} %"
         )
-    return "; ".join(parts)
+    return parts

@@ -57,7 +57,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
                 worth = v.shown(0.01 * mu[name] * most, 3)
                 more = f"1 % more of it gives {worth} on this hardware"
                 over_kappa.append(f"{words}{of} binds; {more}.")
-    ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
+    ranges = [key.rpartition(" ") for key in result["controller"]["at_range"]]
     ends = [f"{name if ': ' in name else name[:1].upper() + name[1:]} is at the {end} end of its "
             "range." for name, _, end in ranges]  # fmt: skip
     return [*over_theta, *over_kappa, *ends]

@@ -31,7 +31,8 @@ from ccd_casadi.plants.plant import (
     hardware_slopes,
     mechanics,
 )
-from ccd_casadi.reporting.decision import advice, current_concern
+from ccd_casadi.reporting.concerns import current_concern
+from ccd_casadi.reporting.decision import advice
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
@@ -300,7 +301,7 @@ def test_a_run_counts_what_feedforward_and_feedback_need_of_the_current() -> Non
     needed = max(entry["feedforward_force"], *(run.peak_force.max() for run in runs))
     assert entry["needed_force"] == pytest.approx(max(needed, entry["peak_force"]), rel=1e-3)
     short = {"status": "verified", "move": entry | {"needed_share": 1.2, "needed_current": 12.0}}
-    assert current_concern(short) == [
+    assert [one.words for one in current_concern(short)] == [
         "the move needs 12 A with feedforward and feedback, and peak_current is 10 A"
     ]
     assert "a larger peak_current" in advice(short)
