@@ -30,7 +30,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     structured_of,
     with_structured,
 )
-from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,

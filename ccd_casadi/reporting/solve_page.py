@@ -190,12 +190,12 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
-    kind, binds = "design", binding
     if "proof" in result:
         from ccd_casadi.reporting.structured_page import binding_words
 
-        kind, binds = "structured", binding_words
-    rows, bound = facts(kind, problem, result), binds(problem, result)
+        rows, bound = facts("structured", problem, result), binding_words(problem, result)
+    else:
+        rows, bound = facts("design", problem, result), binding(problem, result)
     body = (
         theta_table(problem, result),
         c.Heading("What binds"),
