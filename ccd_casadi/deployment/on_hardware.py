@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup

@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.discretise import (
     Conversion,
     Target,
@@ -41,7 +42,6 @@ from ccd_casadi.deployment.reduction import (
     smallest,
 )
 from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
-from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops

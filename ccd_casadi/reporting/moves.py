@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c

@@ -9,9 +9,9 @@ from oracles import random_moves as moves
 from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.motor import Motion, MotionAt, MotionOptions, Motor, cycle_of, with_motion
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of

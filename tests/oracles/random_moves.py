@@ -20,9 +20,9 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import eigh, expm
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.fixed_structure.structure import Structure

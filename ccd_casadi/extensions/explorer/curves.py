@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
 from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
