@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import eigh, expm
 
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.deployment.on_hardware import on_hardware

@@ -19,11 +19,13 @@ import numpy as np
 from ccd_casadi.analysis.loop_warnings import bandwidth_dip
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
+from ccd_casadi.fixed_structure.design import SectionsDesign
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_plant_set as plant_set
 from ccd_casadi.inner_problem.structured_search import with_range
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ

@@ -22,11 +22,12 @@ from peer_table import keep
 from scipy.linalg import block_diag, solve_continuous_are, solve_continuous_lyapunov
 
 import ccd_casadi as ccd
-from ccd_casadi.budget import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
-from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.budget.sources import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.least_value import RmsError
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
 

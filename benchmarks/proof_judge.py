@@ -26,12 +26,8 @@ from ccd_casadi.cases.run_files import sections_kappa
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
-    structured_of,
-    uncertain_plant,
-)
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.plants.modal import modal_plant
 
 CASE = Path(__file__).parent.parent / "runs" / "rib_stage_built.toml"

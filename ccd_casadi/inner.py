@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.first_look import SEARCH, is_searched
+from ccd_casadi.cases import SEARCH, is_searched
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.options import break_frequencies, break_frequency_options, option
 from ccd_casadi.support.terminal import inform

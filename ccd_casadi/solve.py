@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.first_look import DRAWING, SAMPLING
+from ccd_casadi.cases import DRAWING, SAMPLING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.options import positive
@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import (
         channel_words,
@@ -39,11 +38,15 @@ def summary(solution: "Solution") -> str:
     words = template("templates/solve.txt", gain_words=gain_words, channel_words=channel_words)
     if r["status"] == "infeasible":
         return words.render(r=r).rstrip()
-    found = r.get("controller", {}).get("sections", ())
+    sections: list[Any] = []
+    if found := r.get("controller", {}).get("sections"):
+        from ccd_casadi.inner_problem.sections_words import SectionWords
+
+        sections = [SectionWords(**item) for item in found]
     return words.render(
         r=r, decision=advice(r), verdict=terminal_lines(r), details=detail_lines(r),
         theta=theta_words(r), hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
-        sections=[SectionWords(**item) for item in found],
+        sections=sections,
         loop_lines=loop_lines(r), required=requirement_lines(r),
         design_plant=design_plant_lines(r.get("robust") or {}),
     ).rstrip()  # fmt: skip
@@ -83,9 +86,7 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
-    from ccd_casadi.cases.diagnosis import diagnose, first_seen
     from ccd_casadi.cases.findings import Severity, Topic, peak_words
-    from ccd_casadi.cases.plant_report import size_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import model_named
 
@@ -94,6 +95,9 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         for words in peak_words(problem.inner.S_max):
             say(f"warning: {words}", sys.stderr)
         return
+    from ccd_casadi.cases.diagnosis import diagnose, first_seen
+    from ccd_casadi.cases.plant_report import size_words
+
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
     if sizes := size_words(facts[0], case):
         say(f"note: in SI, at the start: {sizes}", sys.stderr)
@@ -108,10 +112,10 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
 
 def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit, sign or loop."""
-    from ccd_casadi.cases.diagnosis import suspicions
-
     if solution.result["status"] == "verified":
         return solution
+    from ccd_casadi.cases.diagnosis import suspicions
+
     causes = suspicions(problem, case.suspension.rigid_modes)
     words = "; ".join(filter(None, [solution.result["reason"], *causes]))
     return replace(solution, result=solution.result | {"reason": words})

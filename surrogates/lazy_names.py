@@ -11,12 +11,13 @@ from types import ModuleType
 class _Package(ModuleType):
     """Keeps a public function where a module of its name is imported, as a command's is."""
 
-    _modules: dict[str, str]
+    _modules: dict[str, tuple[str, str]]
 
     def __getattr__(self, name: str) -> object:
         if name not in self._modules:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(self._modules[name]), name)
+        module, own = self._modules[name]
+        value = getattr(import_module(module), own)
         setattr(self, name, value)
         return value
 
@@ -44,7 +45,7 @@ def from_stub(package: str) -> list[str]:
     module = sys.modules[package]
     with open(f"{str(module.__file__).removesuffix('.py')}.pyi", encoding="utf-8") as stub:
         lines = [line.split() for line in stub if line.startswith("from ")]
-    # `from MODULE import NAME as NAME`
-    vars(module)["_modules"] = {words[3]: words[1] for words in lines}
+    # `from MODULE import OWN as NAME`
+    vars(module)["_modules"] = {words[5]: (words[1], words[3]) for words in lines}
     module.__class__ = _Package
     return sorted(vars(module)["_modules"])

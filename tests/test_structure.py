@@ -95,3 +95,65 @@ def test_names_are_words_of_the_field() -> None:
         if isinstance(name, str) and NO_NAMES & set(name.lower().strip("_").split("_"))
     }
     assert sorted(found) == []
+
+
+DECIDE = ("codesign", "deployment", "reporting", "robust", "studies")
+SENTENCE = {"words", "sentence", "clauses"}
+READING = {"split", "startswith", "endswith", "partition", "rpartition", "removeprefix", "find"}
+
+
+def parsed_sentences(tree: ast.AST) -> set[str]:
+    """Where code reads sentences of its own: searches in them, compares them, takes them apart."""
+
+    def is_sentence(node: ast.AST) -> bool:
+        match node:
+            case ast.Subscript(slice=ast.Constant(name)):  # of result.json
+                return name in {*SENTENCE, "reason"}
+            case ast.Name(name) | ast.Attribute(attr=name):
+                return name in SENTENCE
+            case ast.Call(ast.Name(name)):
+                return name.endswith("_words")
+        return False
+
+    found = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Call(ast.Attribute(value, attr)) if attr in READING and is_sentence(value):
+                found.add(ast.unparse(node))
+            case ast.Call(ast.Attribute(ast.Name("re")), args) if any(map(is_sentence, args)):
+                found.add(ast.unparse(node))
+            case ast.Compare(left, ops, sides):
+                of_text = any(isinstance(op, ast.In | ast.NotIn | ast.Eq | ast.NotEq) for op in ops)
+                empty = any(isinstance(one, ast.Constant) and not one.value for one in sides)
+                if of_text and not empty and any(map(is_sentence, (left, *sides))):
+                    found.add(ast.unparse(node))
+    return found
+
+
+def test_no_decision_hangs_on_a_sentence() -> None:
+    found = {
+        f"{module}: {line}"
+        for module, tree in modules().items()
+        if module.startswith(tuple(f"ccd_casadi.{room}." for room in DECIDE))
+        for line in parsed_sentences(tree)
+    }
+    assert not found, "decide by an enumerated reason or a state; words are rendered from these"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "x.words.split('; ')", "line['reason'].startswith('none')", "'proven' in found.words",
+        "words in current", "re.search('a', x.words)", "reason_words(a, b).split('; ')",
+        "a.words == 'none'",
+    ],
+)  # fmt: skip
+def test_parsed_sentences_are_seen(line: str) -> None:
+    assert parsed_sentences(ast.parse(line))
+
+
+@pytest.mark.parametrize(
+    "line", ["x.words == ''", "name.split(' ')", "f(x.words)", "x.reason in {R.A}"]
+)
+def test_what_is_no_parsed_sentence(line: str) -> None:
+    assert not parsed_sentences(ast.parse(line))

@@ -1,1 +1,30 @@
-"""What a finished loop does, over frequency and over time, whatever kind of design it is of."""
+"""What a finished loop does, over frequency and over time, whatever kind of design it is of.
+
+The names here are read by commands before anything that computes is imported.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+@dataclass(frozen=True)
+class MoveLimits:
+    """Limits of a move.
+
+    Attributes
+    ----------
+    stroke, velocity, acceleration, jerk, snap : float
+        The stroke, and bounds of its derivatives; unit of y and s.
+    window : float
+        In which a move ends where no other is given, m.
+    """
+
+    stroke: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    snap: float
+    window: ClassVar[float] = 1e-6
+
+
+LIMITS = MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4)  # the move that is made where none is given

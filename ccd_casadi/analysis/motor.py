@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import forward_force
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.fixed_parameters import reparametrised

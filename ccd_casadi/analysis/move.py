@@ -8,9 +8,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.ports import BreakPoint, course
 from ccd_casadi.lti.state_space import ClosedLoop, closed_loop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array, states

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import in_w
 from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, sigma_max
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.budget import (
+from ccd_casadi.budget.sources import (
     ErrorBudget,
     ErrorSource,
     ShapedSpectrum,

@@ -10,8 +10,6 @@ from ccd_casadi.cases.budget import error_budget, places_of
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
 from ccd_casadi.cases.controller_tables import filters_of, motion_problem
-from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
 from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
@@ -20,9 +18,13 @@ from ccd_casadi.inner_problem.controller_problem import (
     RobustSet,
 )
 from ccd_casadi.inner_problem.plant_source import PlantSource
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, refuse_ports, scaled_plant
-from ccd_casadi.inner_problem.structured_bandwidth import require_motion
-from ccd_casadi.inner_problem.structured_plant_set import break_points_of, with_options
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    refuse_ports,
+    scaled_plant,
+    with_options,
+)
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.lti.wiring import Wiring
@@ -130,12 +132,18 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             problem = _with_a_scale(problem)
         _require_ports_known(problem)
         if (motion := problem.source.motion) is not None:
+            from ccd_casadi.inner_problem.structured_bandwidth import require_motion
+            from ccd_casadi.inner_problem.structured_plant_set import break_points_of
+
             if places := break_points_of(problem):  # the one whose error counts moves
                 motion = replace(motion, output=places[0].output)
                 problem = replace(problem, source=replace(problem.source, motion=motion))
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
+            from ccd_casadi.cases.diagnosis import diagnose
+            from ccd_casadi.cases.findings import Severity, Topic
+
             with kept_quiet(True):
                 found = diagnose(problem, case.suspension.rigid_modes)[1]
             for finding in found:
@@ -179,6 +187,8 @@ def _suspension(case: Case) -> Suspension:
 
 def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:
     """The problem with an M_K that bounds nothing: loops are computed in units of it."""
+    from ccd_casadi.cases.findings import suitable_effort
+
     unit = replace(problem, weights=replace(problem.weights, M_K=1.0))
     M_K = suitable_effort(unit, scaled_plant(unit, unit.start))
     return replace(problem, weights=replace(problem.weights, M_K=M_K))

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from ccd_casadi.budget import SourceKind
+from ccd_casadi.budget.sources import SourceKind
 from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
 from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
-from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES, RMS_ERROR, Options
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
@@ -16,6 +17,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     Uncertainty,
     of_sensor,
 )
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.weights import Weights
 

@@ -3,13 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.analysis.motor import Motion, Motor
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, corners_hz, damping_ratios, key, one_or_more
 from ccd_casadi.lti.wiring import Filters
+
+if TYPE_CHECKING:
+    from ccd_casadi.analysis.motor import Motion
 
 Numbers = float | tuple[float, ...] | None
 OF_A_MOTOR = ("force_constant", "resistance", "peak_current", "moving_mass")
@@ -116,11 +118,13 @@ def filters_of(table: "FiltersTable") -> Filters:
 
 def motion_problem(
     move: MoveTable, motor: MotorTable, rate_hz: float | None, *, shortest: float = 1e-4
-) -> Motion | None:
+) -> "Motion | None":
     """The move and its motor in SI; None for a case without a move. Jerk changes over `shortest` s
     where neither snap nor a sampling rate is given."""
     if move == MoveTable():
         return None
+    from ccd_casadi.analysis.motor import Motion, Motor
+
     given = {item.name: getattr(move, item.name) for item in fields(move)}
     shortest = shortest if rate_hz is None else 1.0 / rate_hz
     limits = MoveLimits(

@@ -29,7 +29,8 @@ from ccd_casadi.cases.controller_kinds import (
 )
 from ccd_casadi.cases.plant_tables import MEASURED
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
-from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ, use_units

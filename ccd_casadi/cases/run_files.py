@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import ChannelStructure, Structure
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

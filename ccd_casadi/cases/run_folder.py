@@ -33,12 +33,13 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     with_ports,
 )
-from ccd_casadi.inner_problem.structured_plant_set import (
-    structure_of,
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_problem import (
+    ChannelProblem,
+    StructuredProblem,
     structured_of,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
 from ccd_casadi.lti.loop import Loop, Sampling

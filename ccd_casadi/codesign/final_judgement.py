@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product, zip_longest
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ccd_casadi.codesign.survival import PEAK, LoopsOffModel, Survival, excess_of, highest, survival
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import (
@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -44,6 +44,9 @@ from ccd_casadi.synthesis.second_engine import (
     second_opinion,
 )
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.design import SectionsDesign
 
 
 def written_plants(
@@ -107,13 +110,15 @@ def second_on_weighted(
 
 
 def second_on_set(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
+    problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign"
 ) -> EngineComparison:
     """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
     plant that its certificate is of, as the loop runs."""
     judged, K = design.certificate, design.controller
     if judged is None or K is None:
         return NOT_COMPARED
+    from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+
     uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
     points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
     pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
@@ -207,7 +212,7 @@ class OtherDamping:
 
 
 def survived(
-    problem: CoDesignProblem, loops: LoopsOffModel, design: DesignFigures | SectionsDesign
+    problem: CoDesignProblem, loops: LoopsOffModel, design: "DesignFigures | SectionsDesign"
 ) -> tuple[Survival | None, RobustCheck | None]:
     """What a certified loop survives and whether its set is kept, without contradicting each other.
 
@@ -238,7 +243,7 @@ def survived(
         marks.append(abs(check.at.shift))
     inner, slack = problem.inner, kind_of(problem).slack
     peak = getattr(design, "sensitivity_peak", np.nan)
-    if isinstance(design, SectionsDesign) and design.certificate is not None:
+    if not isinstance(design, DesignFigures) and design.certificate is not None:
         peak = max(plant.S_peak for plant in design.certificate.plants)
     # What the first engine finds above S_max fails its own line; only the second is judged here.
     slack = float(np.fmax(1.0, peak / inner.S_max)) * (1.0 + slack) - 1.0

@@ -10,13 +10,10 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.final_judgement import judge_on_model, second_on_set, second_on_weighted
-from ccd_casadi.codesign.result_entries import (
+from ccd_casadi.codesign.result_entries import budget_entry, controller_dict, mixed_dict, move_entry
+from ccd_casadi.codesign.structured_entries import (
     active_of,
-    budget_entry,
-    controller_dict,
     design_dict,
-    mixed_dict,
-    move_entry,
     proof_dict,
     robust_dict,
     sections_controller,
@@ -31,7 +28,8 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_design,
 )
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints

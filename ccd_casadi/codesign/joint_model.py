@@ -16,12 +16,8 @@ from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Loo
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
-    structured_of,
-    uncertain_plant,
-)
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.optim.trust_region import (
     Iterate,
     Radius,

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,8 +28,6 @@ from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import distinct
-from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -42,6 +41,9 @@ from ccd_casadi.support.text import counted
 from ccd_casadi.support.time_budget import ends_early, time_is_up
 from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.post_optimal import PostOptimal
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,8 @@ def is_expensive(problem: CoDesignProblem) -> bool:
     return plant_of(problem).expensive
 
 
-class Outer(ABC):
-    """The outer problem of one kind of inner problem, on a sampler's store and workers."""
+class OuterSearch(ABC):
+    """How designs of one kind are searched for, on a sampler's store and workers."""
 
     kkt_level: float  # scaled KKT residual up to which x counts as stationary
     same_optimum = 1e-2  # of the box: ends of local solves that are closer are one optimum
@@ -125,14 +127,6 @@ class Outer(ABC):
     def bounds(self) -> Box:
         """The bounds of x."""
         return box(self.problem)
-
-    def prepared(self, seed: int) -> "Outer":
-        """This, ready for a search: for instance with warm starts for the controller."""
-        return self
-
-    def resumed(self, folder: Path, seed: int) -> "Outer":
-        """This, with the warm starts and plants of the run in a folder, where a kind has them."""
-        return self
 
     def solve_formulation(
         self, formulation: Formulation, seed: int, given: KnownSamples | None = None
@@ -187,16 +181,6 @@ class Outer(ABC):
         """Local solve on the truth from x, then compare with a wider search of the inner problem
         at its θ (`gap`)."""
 
-    def extended(self, end: PolishedDesign) -> "Outer | None":
-        """This, with the plants on which an end exceeds a bound, to search again; None where there
-        are none."""
-        return None
-
-    def refuted(self, verified: Verified) -> "Outer | None":
-        """This, with the plants by which the judge refutes a design, to search again from it; None
-        where there are none."""
-        return None
-
     def with_training_sample(
         self, outcome: FormulationResult, end: PolishedDesign
     ) -> FormulationResult:
@@ -224,22 +208,56 @@ class Outer(ABC):
         `settled`: relative change of J per step at which it stops, the kind's own by default.
         """
 
-    def failure_reason(self, solution: Solution, share: float | None) -> str:
-        """Why a solution is not verified. `share`: part of the tolerance of a robust set of plants
-        up to which the homotopy found designs."""
-        return str(solution.result["reason"])
+
+class OuterJudge(ABC):
+    """How the end of a search is judged."""
 
     @abstractmethod
     def verified(self, end: PolishedDesign, rounds: int) -> Verified:
         """Judge the design on the truth, after this number of `rounds` of the whole search."""
+
+
+class OuterDescription(ABC):
+    """What is said of a run and its design."""
+
+    def failure_reason(self, solution: Solution, share: float | None) -> str:
+        """Why a solution is not verified. `share`: part of the tolerance of a robust set of plants
+        up to which the homotopy found designs."""
+        return str(solution.result["reason"])
 
     def point_of(self, theta: Sequence[float], weights: Weights) -> Array:
         """x of a design at θ (SI) with these weights."""
         return np.array(theta)
 
     @abstractmethod
-    def responses(self, x: Array) -> PostOptimal:
+    def responses(self, x: Array) -> "PostOptimal":
         """Derivatives of an optimum at x to the data of the problem (post-optimal sensitivity)."""
+
+
+class Outer(OuterSearch, OuterJudge, OuterDescription):
+    """The outer problem of one kind of inner problem: a function takes the part that it needs.
+
+    What a search has found out (warm starts, plants) is passed on by another `Outer`: none of them
+    changes.
+    """
+
+    def prepared(self, seed: int) -> "Outer":
+        """This, ready for a search: for instance with warm starts for the controller."""
+        return self
+
+    def resumed(self, folder: Path, seed: int) -> "Outer":
+        """This, with the warm starts and plants of the run in a folder, where a kind has them."""
+        return self
+
+    def extended(self, end: PolishedDesign) -> "Outer | None":
+        """This, with the plants on which an end exceeds a bound, to search again; None where there
+        are none."""
+        return None
+
+    def refuted(self, verified: Verified) -> "Outer | None":
+        """This, with the plants by which the judge refutes a design, to search again from it; None
+        where there are none."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -274,6 +292,8 @@ class ThetaOuter(Outer, ABC):
         with sampler.spent.on("polish"):
             best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, self.options.settled)
+        from ccd_casadi.codesign.theta_kkt import theta_kkt
+
         kkt = theta_kkt(problem, best, sampler)
         return PolishedDesign(
             np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan
@@ -289,10 +309,12 @@ class ThetaOuter(Outer, ABC):
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
+        from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
+
         stationary = theta_kkt(problem, best).stationarity <= ThetaKktOptions().smooth
         return Place(np.array(best.theta), J, stationary)
 
-    def responses(self, x: Array) -> PostOptimal:
+    def responses(self, x: Array) -> "PostOptimal":
         raise UserError("insight has no derivatives of an optimum of this kind of controller")
 
 

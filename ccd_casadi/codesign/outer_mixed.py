@@ -6,6 +6,7 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -34,6 +34,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.post_optimal import PostOptimal
 
 
 @dataclass(frozen=True)
@@ -150,5 +153,7 @@ class MixedOuter(Outer):
     def point_of(self, theta: Sequence[float], weights: Weights) -> Array:
         return np.append(theta, np.log([weights.omega_S, weights.omega_T]))
 
-    def responses(self, x: Array) -> PostOptimal:
+    def responses(self, x: Array) -> "PostOptimal":
+        from ccd_casadi.codesign.post_optimal import post_optimal
+
         return post_optimal(self.problem, x, self.sampler.quiet)

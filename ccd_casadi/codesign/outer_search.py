@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
-from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign, is_expensive
+from ccd_casadi.codesign.outer import Outer, OuterSearch, Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.result_entries import start_entry
 from ccd_casadi.codesign.verified import Solution
@@ -43,7 +43,7 @@ class GlobalCheckOptions:
 
 
 def global_check(
-    outer: Outer,
+    outer: OuterSearch,
     end: PolishedDesign,
     points: int,
     seed: int,
@@ -117,7 +117,7 @@ def _ends(problem: CoDesignProblem, theta: Array, same: float) -> Array:
 
 
 def perturbed(
-    outer: Outer, x: Array, seed: int, options: GlobalCheckOptions = GlobalCheckOptions()
+    outer: OuterSearch, x: Array, seed: int, options: GlobalCheckOptions = GlobalCheckOptions()
 ) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
     here, bounds = outer.theta_of(x), box(outer.problem)
@@ -132,7 +132,9 @@ def perturbed(
     return found
 
 
-def _spread(outer: Outer, points: int, seed: int, cluster: float) -> tuple[list[InnerSample], int]:
+def _spread(
+    outer: OuterSearch, points: int, seed: int, cluster: float
+) -> tuple[list[InnerSample], int]:
     """The inner problems that the run has solved, and as many more as make up `points`; where these
     are expensive, those of a spread set that none is near. Second, how many these are."""
     sampler, bounds = outer.sampler, box(outer.problem)
@@ -234,7 +236,7 @@ def search_outer(
     return SearchResult(outer, outcome, end, rounds, global_check)
 
 
-def _at_hand(outer: Outer, end: PolishedDesign | None) -> Array | None:
+def _at_hand(outer: OuterSearch, end: PolishedDesign | None) -> Array | None:
     """x where the time is up and a formulation has none: of an end before, else the start."""
     if end is not None or violated(outer.problem, outer.problem.start):
         return None if end is None else end.x
@@ -244,7 +246,7 @@ def _at_hand(outer: Outer, end: PolishedDesign | None) -> Array | None:
 
 
 def _after_global_check(
-    outer: Outer,
+    outer: OuterSearch,
     outcome: FormulationResult,
     end: PolishedDesign,
     formulation: Formulation,

@@ -32,14 +32,15 @@ from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.plants.plant import hardware_cost

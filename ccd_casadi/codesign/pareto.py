@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.outer import OuterSearch
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.result_entries import bound_words
+from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
@@ -68,7 +68,7 @@ class Front:
 
 
 def pareto_front(
-    outer_of: Callable[[Sampler], Outer],
+    outer_of: Callable[[Sampler], OuterSearch],
     sampler: Sampler,
     own: Sequence[float],
     *,

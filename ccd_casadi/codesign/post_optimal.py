@@ -33,7 +33,8 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.optim.kkt import ActiveSet, KktCertificate, KktOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes

@@ -6,7 +6,6 @@ so that 0 binds and what is negative is missed. The figures are the judge's, of 
 function returned them.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import isfinite, nan
@@ -14,12 +13,10 @@ from typing import Any
 
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.fixed_structure.bounds import Bounds, key_words, kind_and_channel
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import constraint_sizes
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.text import HZ
 
@@ -93,8 +90,8 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
         kind_of(verified.problem).bounds(),
         verified.judgement,
     )
-    required, worst = _required(bounds), _worst(verified, bounds, peak_hz)
-    proven = _proven(verified)
+    required, worst = _required(bounds), verified.largest_at(bounds, peak_hz)
+    proven = verified.proven()
     evidence = Evidence.SEARCHED if judged.plants > 1 else Evidence.JUDGED
     found = []
     of_set = verified.robust if isinstance(verified, VerifiedDesign) else None
@@ -113,8 +110,8 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
                 key_words(name), required[name], achieved, 1.0 - achieved / required[name],
                 *worst.get(name, ("", nan)), Evidence.PROVEN if name in proven else evidence,
             ))  # fmt: skip
-    if isinstance(verified, VerifiedStructured) and structured_of(problem).bandwidth_least:
-        least, hz = structured_of(problem).bandwidth_least / HZ, verified.bandwidth / HZ
+    if problem.controller.bandwidth_least:
+        least, hz = problem.controller.bandwidth_least / HZ, verified.bandwidth / HZ
         found.append(
             Requirement("bandwidth_least_hz", least, hz, hz / least - 1.0, "", nan, evidence)
         )
@@ -139,51 +136,3 @@ def _required(bounds: Bounds) -> dict[str, float]:
     for own in bounds.channels:
         known |= {f"S_max of {own.name}": own.S_max, f"KS of {own.name}": own.M_K and level}
     return {name: value for name, value in known.items() if value is not None}
-
-
-def _proven(verified: Verified) -> set[str]:
-    """Which of the judge's figures a proof holds on the whole set."""
-    if not isinstance(verified, VerifiedStructured) or not verified.proof.applies:
-        return set()
-    proof = verified.proof
-    raw = {"S_MAX": "S_max", "S_LOW": "S_low"}
-    found = set()
-    for name, level in proof.levels.items():
-        kind, channel = kind_and_channel(name)
-        if level <= 1.0 + proof.slack:
-            found.add(raw.get(kind, kind) + (f" of {channel}" if channel else ""))
-    return found
-
-
-def _worst(verified: Verified, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
-    """On which plant that the design was made on each figure is largest, and at which frequency."""
-    low = bounds.omega_low / HZ
-    if not isinstance(verified, VerifiedStructured):
-        return {"S_max": ("", peak_hz), "S_low": ("", low)}
-    judged, own = verified.design.certificate, structured_of(verified.problem)
-    if judged is None or not all(plant.stable for plant in judged.plants):
-        return {}
-    uncertain = uncertain_plant(verified.problem, verified.theta)
-    points = [(option, tuple(point)) for option, point in own.scenarios]
-    points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
-    shares = [bounds.shares(plant) for plant in judged.plants]
-    found = {}
-    for name in shares[0]:
-        i = max(range(len(shares)), key=lambda i: shares[i][name])
-        hz = {"S_max": judged.plants[i].S_peak_frequency / HZ, "S_low": low}.get(name, nan)
-        alone = len(shares) == 1
-        label = "" if alone or i >= len(points) else _plant_words(uncertain.names, *points[i])
-        found[name] = (label, hz)
-    return found
-
-
-def _plant_words(names: Sequence[str], option: int, point: Sequence[float]) -> str:
-    parts = [f"[robust] plants {option}"] if option else []
-    for name, value in zip(names, point, strict=True):
-        if name.startswith("theta."):
-            parts.append(f"{name.removeprefix('theta.')} = {value:.4g}")
-        elif name == "damping":
-            parts += [f"damping x {value:g}"] if value != 1.0 else []
-        elif value:
-            parts.append(f"{name} {100.0 * value:+.3g} %")
-    return ", ".join(parts) or "the model"

@@ -10,11 +10,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
@@ -40,6 +39,9 @@ from ccd_casadi.support.text import versions
 from ccd_casadi.support.time_budget import TimeBudget
 from surrogates import Quality, save
 from surrogates.files import write_whole
+
+if TYPE_CHECKING:
+    from ccd_casadi.cases.run_folder import FinishedRun
 
 FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or changes its meaning
 
@@ -150,11 +152,11 @@ def of_budget(
         With `time_budget` and `phase_seconds` in its result.
     """
     own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
-    result, words = {**solution.result, **own}, spent.words
+    result, words = {**solution.result, **own}, "; ".join(spent.clauses)
     if words and "verdict" in result:
         line = result["verdict"]["optimal"]
         figures = {key: v for key, v in line.items() if key not in ("state", "words", "details")}
-        own_line = VerdictLine.of(State.UNKNOWN, (*words.split("; "), *clauses_of(line)), figures)
+        own_line = VerdictLine.of(State.UNKNOWN, (*spent.clauses, *clauses_of(line)), figures)
         verdict = result["verdict"] = {**result["verdict"], "optimal": own_line.entry}
         unknown = dict.fromkeys(("inner_optimum", "optimality"))
         checks = result["checks"] = {**result["checks"], **unknown}
@@ -219,7 +221,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine) -> FinishedRun:
+def with_verdict_line(run: "FinishedRun", out: Path, name: str, line: VerdictLine) -> "FinishedRun":
     """Replace a line of a run's verdict, and write it if `out` is within the run's folder.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
@@ -239,6 +241,8 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
     FinishedRun
         With the line in its result.
     """
+    from ccd_casadi.cases.run_folder import read_json
+
     folder, before = run.folder.resolve(), at_solve(run.result, name)
     if not before or not out.resolve().is_relative_to(folder):
         return run

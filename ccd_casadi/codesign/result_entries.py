@@ -1,39 +1,25 @@
 """Designs as entries of result.json and controller.json."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import compliance_of, loop_entry
-from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.budget import BudgetFigures, SourceFigures
-from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import BINDS, BrokenAt, key_words, kind_and_channel
-from ccd_casadi.fixed_structure.certificate import JudgeOptions
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of
-from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
 if TYPE_CHECKING:
-    from ccd_casadi.fixed_structure.box_proof import Proof
+    from ccd_casadi.budget.evaluation import BudgetFigures, SourceFigures
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
@@ -121,6 +107,8 @@ def move_entry(
     """`move` as the one key of a mapping, SI; nothing where the problem has none."""
     if problem.source.motion is None:
         return {}
+    from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
+
     motion = motion_of(problem, theta)
     made = exact_moves(motion, design_loops(problem, theta, controller))
     cycle, own = motion.cycle, problem.source.motion
@@ -172,7 +160,7 @@ def budget_dict(budget: LoopBudget) -> dict[str, Any]:
     }
 
 
-def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
+def _source(item: "SourceFigures", whole: "BudgetFigures") -> dict[str, Any]:
     windowed = whole.window is not None
     return {
         "name": item.source.name,
@@ -185,286 +173,6 @@ def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
         "force_rms": item.force,
         "disagreement": item.disagreement,
     }
-
-
-WORST = 1.0 + JudgeOptions.tolerance  # figure over bound that the judge counts as met
-
-
-def design_dict(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
-) -> dict[str, Any]:
-    """A certified design's figures under the contract's keys, the worst of its plants.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-        With the set of plants.
-    theta : (n_θ,) sequence
-        SI.
-    design : SectionsDesign
-        With its certificate.
-
-    Returns
-    -------
-    dict
-        SI, and Hz where a key says so.
-    """
-    judged = design.certificate
-    assert judged is not None
-    highest = max(judged.plants, key=lambda plant: plant.S_peak)
-    sampling, loop = problem.sampling, dict[str, Any]()
-    if all(plant.stable for plant in judged.plants):  # else there are no margins and steps
-        assert design.controller is not None
-        loops = design_loops(problem, theta, design.controller)
-        loop = loop_entry(loops, design.bandwidth, highest.S_peak)
-    grown = max(plant.stability for plant in judged.plants)
-    if sampling is not None:  # of the spectral radius: the real part that it comes from
-        grown = float(np.log1p(grown)) / sampling.period
-    ratios, ported = judged.worst, {}
-    if loop and loops[0].ported:
-        ported = compliance_dict(*compliance_of(loops, problem.inner.omega_low))
-        between = plant_of(problem).between
-        ported["compliance_words"] += f", {between}"
-    return {
-        **dict.fromkeys(("omega_S_hz", "omega_T_hz")),
-        "outcome": design.outcome.name.lower(),
-        "reason": "" if design.certified else design.words,
-        "bandwidth_hz": design.bandwidth / HZ,
-        **dict.fromkeys(("gamma_opt", "gamma", "gamma_lower_bound")),
-        "sensitivity_peak": highest.S_peak,
-        "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
-        "sensitivity_low": max(plant.S_low for plant in judged.plants),
-        **compliance_dict(
-            max(plant.GS for plant in judged.plants),
-            max(plant.static_compliance for plant in judged.plants),
-            max(plant.low_compliance for plant in judged.plants),
-            problem.inner.omega_low / HZ,
-        ),
-        **ported,  # of other forces, and of what counts
-        "KS_max": max(plant.KS for plant in judged.plants),
-        **loop,
-        **_channel_entry(bounds_of(problem), judged),
-        "certificate": {
-            "stable": all(plant.stable for plant in judged.plants),
-            "max_real_pole": grown,
-            "norm": max(ratios.values()),
-            "norm_bound": WORST,
-            "passed": judged.passed,
-            "plants": len(judged.plants),
-            "figures_over_bounds": ratios,
-        },
-        "controller": sections_dict(design.structure, design.kappa)
-        | {
-            "kappa": design.kappa.tolist(),
-            "local_optima": [
-                {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
-                for item in design.local_optima
-            ],
-            "starts": design.starts,
-            "best_found": design.found,
-            "multipliers": design.multipliers,
-            "at_range": [f"{name} {end}" for name, end, _ in design.at_box],
-            "kkt_residual": design.kkt_residual,
-        },
-    }
-
-
-def active_of(design: SectionsDesign) -> list[str]:
-    """The bounds on the loop that bind a controller of fixed structure.
-
-    Parameters
-    ----------
-    design : SectionsDesign
-        With its multipliers.
-
-    Returns
-    -------
-    list of str
-        Keys of the case file.
-    """
-    return bound_words(name for name, mu in design.multipliers.items() if mu > 1e-6)
-
-
-def bound_words(names: Iterable[str]) -> list[str]:
-    """Bounds on the loop as a reader knows them, of rows by kind and channel.
-
-    >>> bound_words(["KS", "CROSSING", "S_MAX of z"])
-    ['S_max of channel z', 'weighted_level of KS']
-    """
-    order = list(BINDS)
-    found = [(kind_and_channel(name), name) for name in names]
-    bounds = [(order.index(kind), of, name) for (kind, of), name in found if kind in BINDS]
-    return [key_words(name) for *_, name in sorted(bounds)]
-
-
-def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
-    """`channel_bounds`: what channels keep for themselves, the worst of the judge's plants."""
-    found = []
-    for i, own in enumerate(bounds.channels):
-        rows = [plant.channels[i] for plant in judged.plants if plant.channels]
-        if not own.given or not rows:
-            continue
-        top = max(rows, key=lambda row: row.S_peak)
-        entry = {
-            "name": own.name,
-            "sensitivity_peak": top.S_peak,
-            "sensitivity_peak_hz": top.S_peak_frequency / HZ,
-            "S_max": own.S_max,
-            "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
-            "bandwidth_ratio": own.bandwidth_ratio,
-        }
-        if own.place is not BrokenAt.WHOLE:  # |S| where the loop is broken there alone
-            del entry["bandwidth_hz"], entry["bandwidth_ratio"]
-            entry["place"] = own.place.value
-        if own.M_K is not None:
-            entry |= {"M_K": own.M_K, "weighted_KS": max(row.weighted_KS for row in rows)}
-        found.append(entry)
-    return {"channel_bounds": found} if found else {}
-
-
-def kept_words(worst: Excess) -> str:
-    """Which bounds hold on a box whose judge is loose, by its worst plant to six digits."""
-    if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
-        return "within every bound"
-    return f"no bound exceeded by more than {100.0 * BoxCheckOptions.looseness:g} %"
-
-
-def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
-    """`robust`: the judge on so many plants of the box, and the worst that was searched."""
-    words = f"stable, {kept_words(worst)} on {counted(plants, 'plant')}"
-    return {
-        "plants": plants,
-        "passed": wide.passed,
-        "words": words if wide.passed else wide.words,
-        "bandwidth_hz": wide.bandwidth / HZ,
-        "worst_excess": float(np.expm1(worst.value)),
-    }
-
-
-def proof_dict(proof: "Proof") -> dict[str, Any]:
-    """Write the entry `proof`: what holds on the whole box.
-
-    Parameters
-    ----------
-    proof : Proof
-
-    Returns
-    -------
-    dict
-        `levels` are figures over their bounds by kind; a refuted proof names the plant.
-    """
-    found: dict[str, Any] = {
-        "outcome": proof.outcome.name.lower(),
-        "words": proof.words,
-        "slack": proof.slack,
-        "parameters": list(proof.parameters),
-        "levels": {key_words(name): level for name, level in proof.levels.items()},
-        "boxes": proof.boxes,
-    }
-    if proof.refuted:
-        found |= {
-            "option": proof.option,
-            "point": list(proof.point),
-            "passed": [key_words(proof.passed[0]), proof.passed[1]],
-        }
-    return found
-
-
-class WithSections(Protocol):
-    """A design that may have a controller of sections."""
-
-    @property
-    def structure(self) -> Structure | ChannelStructure: ...
-
-    @property
-    def kappa(self) -> Array: ...
-
-    @property
-    def controller(self) -> StateSpace | None: ...
-
-
-def sections_controller(design: WithSections, sampling: Sampling | None) -> dict[str, Any]:
-    """The content of controller.json: the state space, the sections, and how they run.
-
-    Parameters
-    ----------
-    design : WithSections
-        With a controller.
-    sampling : Sampling or None
-        Of the loop.
-
-    Returns
-    -------
-    dict
-        JSON values, SI.
-    """
-    assert design.controller is not None
-    words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
-    if sampling is not None:
-        words["loop"] = vars(sampling) | {"method": "tustin"}
-    return controller_dict(design.controller) | {"sections": words}
-
-
-PROVEN = {
-    OwnSet.KEPT: "proven",
-    OwnSet.UNPROVEN: "not every bound is proven",
-    OwnSet.SEARCHED: "searched, not proven",
-}
-
-
-def box_words(
-    wide: SetCertificate, checked: int, proof: "Proof", worst: Excess, drawn: Yield | None,
-    *, along: bool,
-) -> dict[str, Any]:  # fmt: skip
-    """Arguments of `survives` for a loop on its box of plants.
-
-    Parameters
-    ----------
-    wide, checked : SetCertificate, int
-        The judge's certificate, on this number of plants of the box.
-    proof : Proof
-        For the whole box.
-    worst : Excess
-        The worst plant that a search found.
-    drawn : Yield or None
-        Random plants.
-    along : bool
-        Whether the common shift is kept.
-
-    Returns
-    -------
-    dict
-        `own`, `own_words` and `figures`.
-    """
-    excess, fresh = math.expm1(worst.value), () if drawn is None else (drawn.words,)
-    figures = {
-        "plants": checked,
-        "worst_excess": excess,
-        "proof": proof.outcome.name.lower(),
-        "proven": proof.levels,
-        "unproven": proof.unasked,
-    }
-    tried = f"{counted(checked, 'plant')} of the [robust] set"
-    found = f"worst plant that a search found: {100.0 + 100.0 * excess:.6g} % of a bound"
-    within = kept_words(worst)
-    own = OwnSet.BROKEN
-    clauses: tuple[str, ...] = (f"{within} on {tried}", found)
-    if not wide.passed:
-        clauses = (wide.words, f"on {tried}")
-    elif proof.denies:
-        clauses = (*proof.clauses, *clauses)
-    elif checked <= 1:
-        own, clauses = OwnSet.NONE, ("judged on the model alone: [robust] names no plant",)
-    elif drawn is not None and drawn.survived < drawn.draws:
-        clauses = (*fresh, *clauses)
-    elif along:
-        own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
-        own = OwnSet.UNPROVEN if proof.unclosed else own
-        clauses = (f"{within} on the [robust] set: {PROVEN[own]}", *proof.clauses,
-                   f"judged on {tried}", found, *fresh)  # fmt: skip
-    else:
-        clauses = ("the [robust] set is not kept all along its common resonance shift", *clauses)
-    return {"own": own, "own_words": clauses, "figures": figures}
 
 
 @dataclass(frozen=True)

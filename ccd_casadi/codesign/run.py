@@ -1,5 +1,6 @@
 """One co-design: sample, fit, solve with IPOPT, verify."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -7,7 +8,6 @@ from tempfile import TemporaryDirectory
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.controller_tables import OuterTable
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.formulations import (
@@ -20,9 +20,7 @@ from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_search import conclude, conclude_at, search_outer
-from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.result import infeasible_dict, of_budget
-from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -217,10 +215,17 @@ def outer_of(sampler: Sampler) -> Outer:
     return OUTERS[type(sampler.problem.controller)](sampler)
 
 
+def _structured(sampler: Sampler) -> Outer:
+    """Imported where a problem has such a controller."""
+    from ccd_casadi.codesign.outer_structured import StructuredOuter
+
+    return StructuredOuter(sampler)
+
+
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
-OUTERS: dict[type[ControllerProblem], type[Outer]] = {
+OUTERS: dict[type[ControllerProblem], Callable[[Sampler], Outer]] = {
     MixedSensitivityProblem: MixedOuter,
-    StructuredProblem: StructuredOuter,
+    StructuredProblem: _structured,
 }
 
 
@@ -261,8 +266,12 @@ def require_solvable(problem: CoDesignProblem) -> None:
 
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
     """A co-design with parameters from lists: local searches near by where its kind knows how."""
+    from ccd_casadi.codesign.catalogue import best_of_lists
+
     terms = RunTerms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     if isinstance(sampler.problem.controller, StructuredProblem):
+        from ccd_casadi.codesign.structured_lists import ListedStructured
+
         of = ListedStructured(
             formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
         )

@@ -14,12 +14,8 @@ from ccd_casadi.inner_problem.structured_bandwidth import (
     StructuredValue,
     structured_value,
 )
-from ccd_casadi.inner_problem.structured_plant_set import (
-    structured_of,
-    uncertain_plant,
-    with_structured,
-)
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
     prepared,

@@ -35,11 +35,9 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
-    structured_of,
     warm_starts_at,
-    with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler

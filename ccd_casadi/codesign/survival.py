@@ -10,8 +10,8 @@ import scipy
 
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, design_loops, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import Loop, Sampling, tustin
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import (
     FREE,

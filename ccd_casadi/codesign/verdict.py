@@ -17,8 +17,8 @@ from typing import Any, Self
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.optim.kkt import Kink, KktCertificate, KktOptions
 from ccd_casadi.support.text import counted, inwards, small_share, spoken, with_unit
 from ccd_casadi.synthesis.second_engine import EngineComparison

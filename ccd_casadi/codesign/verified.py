@@ -18,6 +18,7 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outp
 from ccd_casadi.codesign.result_entries import controller_dict
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import VerdictLine, VerdictOptions, search_evidence, survives
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -26,6 +27,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import NotebookHtml
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.second_engine import NOT_COMPARED, EngineComparison
 from surrogates import GaussianProcess, Quality
 
@@ -106,6 +108,15 @@ class Verified(ABC):
     @abstractmethod
     def evidence(self, predicted: float) -> dict[str, Any]:
         """What else its kind has to show, by keys of result.json; `predicted` is of its value."""
+
+    def largest_at(self, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
+        """On which plant that the design was made on a figure of the judge is largest, in words,
+        and at which frequency (Hz); `peak_hz` is that of |S| of one plant."""
+        return {"S_max": ("", peak_hz), "S_low": ("", bounds.omega_low / HZ)}
+
+    def proven(self) -> set[str]:
+        """Which of the judge's figures a proof holds on the whole set."""
+        return set()
 
     def checks(self) -> dict[str, bool]:
         """Checks besides those that every design passes."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
-from ccd_casadi.codesign.result_entries import (
+from ccd_casadi.codesign.structured_entries import (
     active_of,
     bound_words,
     box_words,
@@ -19,8 +19,9 @@ from ccd_casadi.codesign.result_entries import (
 )
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.design import DesignOptions
+from ccd_casadi.fixed_structure.bounds import Bounds, kind_and_channel
+from ccd_casadi.fixed_structure.certificate import SetCertificate
+from ccd_casadi.fixed_structure.design import DesignOptions, SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.fixed_structure.worst_plant import Excess
@@ -29,13 +30,8 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structured_of,
-    uncertain_plant,
-    with_structured,
-)
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
@@ -212,6 +208,34 @@ class VerifiedStructured(Verified):
             **({} if self.damping is None else self.damping.entry),
         }
 
+    def largest_at(self, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
+        judged, own = self.design.certificate, structured_of(self.problem)
+        if judged is None or not all(plant.stable for plant in judged.plants):
+            return {}
+        uncertain, low = uncertain_plant(self.problem, self.theta), bounds.omega_low / HZ
+        points = [(option, tuple(point)) for option, point in own.scenarios]
+        points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
+        shares = [bounds.shares(plant) for plant in judged.plants]
+        found = {}
+        for name in shares[0]:
+            i = max(range(len(shares)), key=lambda i: shares[i][name])
+            at = {"S_max": judged.plants[i].S_peak_frequency / HZ, "S_low": low}
+            alone = len(shares) == 1
+            label = "" if alone or i >= len(points) else _plant_words(uncertain.names, *points[i])
+            found[name] = (label, at.get(name, math.nan))
+        return found
+
+    def proven(self) -> set[str]:
+        if not self.proof.applies:
+            return set()
+        raw = {"S_MAX": "S_max", "S_LOW": "S_low"}
+        found = set()
+        for name, level in self.proof.levels.items():
+            kind, channel = kind_and_channel(name)
+            if level <= 1.0 + self.proof.slack:
+                found.add(raw.get(kind, kind) + (f" of {channel}" if channel else ""))
+        return found
+
     def checks(self) -> dict[str, bool]:
         drawn = None if self.reported is None else self.reported[1]
         later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
@@ -224,7 +248,7 @@ class VerifiedStructured(Verified):
         judged = self.design.certificate
         figures = {} if judged is None else {"figures_over_bounds": judged.worst}
         if not self.certified:
-            return VerdictLine.of(State.FAILED, self.design.words.split("; "), figures)
+            return VerdictLine.of(State.FAILED, (self.design.words,), figures)
         if not self.feasible:
             words = "certified, but a constraint on theta is not met"
             return VerdictLine.of(State.FAILED, (words,), figures)
@@ -287,3 +311,15 @@ class VerifiedStructured(Verified):
 def multistart_words(ends: Sequence[float]) -> str:
     """Where the searches of a multi-start search ended, in Hz, each apart from the others."""
     return f"a multi-start search at this theta ended at {', '.join(distinct_texts(ends))} Hz"
+
+
+def _plant_words(names: Sequence[str], option: int, point: Sequence[float]) -> str:
+    parts = [f"[robust] plants {option}"] if option else []
+    for name, value in zip(names, point, strict=True):
+        if name.startswith("theta."):
+            parts.append(f"{name.removeprefix('theta.')} = {value:.4g}")
+        elif name == "damping":
+            parts += [f"damping x {value:g}"] if value != 1.0 else []
+        elif value:
+            parts.append(f"{name} {100.0 * value:+.3g} %")
+    return ", ".join(parts) or "the model"

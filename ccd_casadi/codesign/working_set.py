@@ -7,12 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint
-from ccd_casadi.inner_problem.structured_plant_set import (
-    structured_of,
-    uncertain_plant,
-    with_structured,
-)
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler

@@ -10,11 +10,11 @@ import numpy as np
 
 from ccd_casadi.analysis.sampled_figures import SampledFigures, loop_figures, worst_figures
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.realisation import LoopChannel
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
-from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ

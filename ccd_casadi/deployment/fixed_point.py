@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.deployment.realisation import Realisation, takeover
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -13,8 +13,7 @@ import numpy as np
 
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
-from ccd_casadi.lti.break_point import BreakPoint
-from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.ports import BreakPoint, course
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.arrays import Array
 

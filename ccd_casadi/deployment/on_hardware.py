@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.loop import DelayOptions
-from ccd_casadi.lti.ports import Ports, course
+from ccd_casadi.lti.ports import BreakPoint, Ports, course
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -16,8 +16,8 @@ from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import LoopChannel, Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.judgement import Judgement
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.loop import Sampling
@@ -253,7 +253,7 @@ def deployed_line(
                 f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
             )
     ends = limit_words(figures["move"] or {})
-    reasons = [*filter(None, (*reason_words(run, found).split("; "), *found.levels, ends))]
+    reasons = [*filter(None, (*reason_clauses(run, found), *found.levels, ends))]
     if found.rounding is not None:
         kept.append(rounding_words(found.rounding))
     if reasons:
@@ -366,12 +366,17 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     str
         Empty where there is nothing to say.
     """
+    return "; ".join(reason_clauses(run, found))
+
+
+def reason_clauses(run: FinishedRun, found: Deployment) -> list[str]:
+    """The same, a clause each."""
     own = f"the run itself is not verified: {found.unverified}"
     parts = [own] if found.unverified else []
     if share := run.case.robust.share_words:
         parts.append(f"{share}: judged here on the {1 + len(found.members)} that it has kept alone")
     if found.shortfalls:
-        return "; ".join([*parts, found.shortfalls[0]])
+        return [*parts, found.shortfalls[0]]
     S_max, over = run.problem.inner.S_max, _over(run, found)
     where = f" ({place_words(found.worst.at)})" if found.members else ""
     if over > 0.0:
@@ -380,4 +385,4 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
             f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
             f"a deployment may exceed it by {allowed:.2g} %"
         )
-    return "; ".join(parts)
+    return parts

@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.discretise import (
     Conversion,
     Target,
@@ -41,13 +42,13 @@ from ccd_casadi.deployment.reduction import (
     smallest,
 )
 from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
-from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation

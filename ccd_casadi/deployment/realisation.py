@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
-from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -17,7 +17,8 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import require_as_returned
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant

@@ -1,15 +1,8 @@
-"""Controllers of fixed structure for sets of plants, continuous or sampled."""
+"""Controllers of fixed structure for sets of plants, continuous or sampled.
 
-from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
-from ccd_casadi.fixed_structure.bounds import ChannelBounds as ChannelBounds
-from ccd_casadi.fixed_structure.bounds import ShapeEnd as ShapeEnd
-from ccd_casadi.fixed_structure.certificate import SetCertificate as SetCertificate
-from ccd_casadi.fixed_structure.certificate import certify as certify
-from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure as ChannelStructure
-from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
-from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
-from ccd_casadi.fixed_structure.structure import Structure as Structure
-from ccd_casadi.lti.loop import Sampling as Sampling
+Its names are imported when they are first used: the bounds of a loop load no search.
+"""
 
-synthesise = synthesise_sections
+from surrogates.lazy_names import from_stub
+
+__all__ = from_stub(__name__)

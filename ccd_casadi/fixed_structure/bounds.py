@@ -7,7 +7,7 @@ from math import log, nan
 
 import numpy as np
 
-from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 

@@ -21,9 +21,9 @@ from typing import Protocol
 
 import numpy as np
 
-from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.evaluation import COMPLEX_STEP, ErrorVariance
 from ccd_casadi.budget.noise_process import run_matrix
+from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import (
     DesignSearch,

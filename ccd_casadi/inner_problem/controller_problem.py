@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.budget.sources import ErrorBudget
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.text import HZ, spoken, with_unit
@@ -75,6 +75,7 @@ class ControllerProblem:
     figure : FigureOfMerit
         What J counts of the controller.
     sampling : Sampling or None
+    bandwidth_least : float
     plant_options : tuple of options
     kernels : tuple of str
         Groups of compiled kernels that its searches need.
@@ -91,6 +92,11 @@ class ControllerProblem:
     def sampling(self) -> Sampling | None:
         """Rate and delay that the controller is designed for; None: continuous."""
         return None
+
+    @property
+    def bandwidth_least(self) -> float:
+        """Below which no design counts, rad/s."""
+        return 0.0
 
     @property
     def plant_options(self) -> tuple[Options, ...]:

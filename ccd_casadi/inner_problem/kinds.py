@@ -1,95 +1,32 @@
 """The kinds of inner problem, what each knows of a problem at a θ, and the loops of its design."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
-from ccd_casadi.budget import BudgetFigures, evaluate_budget
-from ccd_casadi.budget.evaluation import variances
-from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.inner_kind import InnerKind
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner, with_ports
-from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
+
+if TYPE_CHECKING:
+    from ccd_casadi.budget.evaluation import BudgetFigures
 
 ENDS = {  # of the ranges, as slopes to (ln ω_S, ln ω_T)
     "omega_S lower": (-1.0, 0.0), "omega_S upper": (1.0, 0.0),
     "omega_T lower": (0.0, -1.0), "omega_T upper": (0.0, 1.0),
 }  # fmt: skip
-
-
-class InnerKind(ABC):
-    """One kind of controller, for a problem; by default on the plant of the case alone, with S_max
-    and S_low.
-
-    Attributes
-    ----------
-    title : str
-        Of such a controller in code.
-    slack : float
-        Relative: by how much its judge lets a bound be exceeded.
-    as_designed : bool
-        Its controllers run as they are, without being reduced.
-    problem : CoDesignProblem
-    """
-
-    title: str = "Controller"
-    slack: float
-    as_designed: bool
-
-    def __init__(self, problem: CoDesignProblem) -> None:
-        self.problem = problem
-
-    @abstractmethod
-    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
-        """v(θ) in SI and its gradient (n,); NaN where no controller is certified."""
-
-    @abstractmethod
-    def described(self) -> tuple[str, str]:
-        """The kind of controller, and how it runs or is searched, for the eye."""
-
-    @abstractmethod
-    def require_function(self) -> None:
-        """Raise UserError where v(θ) is not yet one function of θ."""
-
-    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        """The plants on which the controller's figures count, the model first."""
-        return [scaled_plant(self.problem, theta)]
-
-    def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        """Those that margins and steps are of: with the plants of a robust set."""
-        return self.plants(theta)
-
-    def bounds(self) -> Bounds:
-        """The bounds on every plant, SI."""
-        inner = self.problem.inner
-        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
-
-    def common_shifts(self) -> tuple[float, float]:
-        """The common resonance shifts, down and up, that its set holds at the model's damping."""
-        return 0.0, 0.0
-
-    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
-        """The extreme factors of damping and of gain in its set."""
-        return (1.0,), (1.0,)
-
-    @abstractmethod
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
-        """What S, KS and T of a design may not exceed, over frequency."""
 
 
 class MixedSensitivity(InnerKind):
@@ -144,69 +81,6 @@ class MixedSensitivity(InnerKind):
                        inner.compliance_max, False)  # fmt: skip
 
 
-class FixedStructure(InnerKind):
-    """Gain, notches, leads and roll-off on a set of plants, sampled or continuous.
-
-    Attributes
-    ----------
-    problem : CoDesignProblem
-        Others as those of `InnerKind`.
-    """
-
-    title = "Controller of sections (integrator, lead, notches, roll-off)"
-    slack = BoxCheckOptions.looseness
-    as_designed = True
-
-    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
-        found = structured_value(self.problem, theta)
-        return found.value, np.array(found.gradient)
-
-    def described(self) -> tuple[str, str]:
-        sampling = self.problem.sampling
-        runs = "in continuous time" if sampling is None else f"at {sampling.rate_hz:.5g} Hz"
-        return "of fixed structure", runs
-
-    def require_function(self) -> None:
-        if not structured_of(self.problem).warm_starts:
-            words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
-            raise UserError(f"the problem of a fixed structure {words}")
-
-    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        return plants_of(self.problem, theta)
-
-    def bounds(self) -> Bounds:
-        return bounds_of(self.problem)
-
-    def common_shifts(self) -> tuple[float, float]:
-        u = structured_of(self.problem).uncertainty
-        low, high = ((1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) for s in (-1, 1))
-        return low - 1.0, high - 1.0
-
-    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
-        u = structured_of(self.problem).uncertainty
-        return u.damping, (1.0 - u.gain, 1.0, 1.0 + u.gain)
-
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
-        """The shape, and weighted_level/|W| of KS (N/m) and T."""
-        inner, structured = self.problem.inner, structured_of(self.problem)
-        level, bounds = structured.weighted_level or np.nan, bounds_of(self.problem)
-
-        def over(hz: Array) -> Array:
-            size = np.abs(self.problem.weights.responses(HZ * hz))
-            below = hz <= bandwidth_hz
-            x = hz / bandwidth_hz
-            room = np.nan if bounds.shape is None else bounds.room(x)
-            rising = room * x * 2.0**-0.5
-            most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
-            counts = below | (structured.shape_ends is ShapeEnd.S_MAX)
-            holds = counts & (most <= inner.S_max)
-            return np.array([np.where(holds, most, np.nan), *(level / size[1:])])
-
-        words = ("its shape", "weighted_level/|W_KS|", "weighted_level/|W_T|")
-        return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words,
-                       structured.compliance_max, True)  # fmt: skip
-
-
 def kind_of(problem: CoDesignProblem) -> InnerKind:
     """Find the kind of inner problem of a co-design problem.
 
@@ -222,10 +96,17 @@ def kind_of(problem: CoDesignProblem) -> InnerKind:
     return KINDS[type(problem.controller)](problem)
 
 
+def _fixed_structure(problem: CoDesignProblem) -> InnerKind:
+    """Its search is imported where a problem has such a controller."""
+    from ccd_casadi.inner_problem.structured_kind import FixedStructure
+
+    return FixedStructure(problem)
+
+
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
-KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
+KINDS: dict[type[ControllerProblem], Callable[[CoDesignProblem], InnerKind]] = {
     MixedSensitivityProblem: MixedSensitivity,
-    StructuredProblem: FixedStructure,
+    StructuredProblem: _fixed_structure,
 }
 
 
@@ -370,7 +251,7 @@ class LoopBudget:
     sampled : bool
     """
 
-    model: BudgetFigures | None
+    model: "BudgetFigures | None"
     plants: int
     largest_error: float
     largest_force: float
@@ -394,6 +275,8 @@ def loop_budget(
     """
     if problem.budget is None:
         return None
+    from ccd_casadi.budget.evaluation import evaluate_budget, variances
+
     loops = design_loops(problem, theta, controller)
     model = evaluate_budget(loops[0], problem.budget)
     found = [variances(loop, problem.budget) for loop in loops]

@@ -10,11 +10,9 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.analysis.motor import Motion, with_motion
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
-from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed, with_wiring
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant, widened
@@ -27,6 +25,9 @@ from ccd_casadi.support.user_code import (
     require_user_code,
     with_time_limit,
 )
+
+if TYPE_CHECKING:
+    from ccd_casadi.analysis.motor import Motion
 
 INSTALLED = {"site-packages", "dist-packages"}
 STANDARD = Path(ast.__file__).parent
@@ -194,7 +195,7 @@ class PlantSource:
     content: str | None = None
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
-    motion: Motion | None = None
+    motion: "Motion | None" = None
     wiring: Wiring = UNWIRED
     given: GivenFunction | None = field(default=None, compare=False)
     wide: bool = False
@@ -280,6 +281,8 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         plant = _below(replace(source, motion=None), size, names, lower, upper)
         own = replace(source, motion=None, wide=False)  # motors are where its own inputs are
         count = _below(own, size, names, lower, upper).inputs if source.wide else plant.inputs
+        from ccd_casadi.analysis.motor import with_motion
+
         return with_motion(plant, motion, names, source.held, count)
     held = source.held
     if source.places is not None:
@@ -294,6 +297,8 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
     else:
         function = _own_function(source)
         function = fixed_model(widened(function) if source.wide else function, held)
+        from ccd_casadi.plants.differenced import user_plant
+
         plant = user_plant(function, names, dict(source.options), lower, upper)
         if not plant.ports:
             return plant

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.inner_problem.controller_problem import (
     ControllerProblem,
     FigureOfMerit,
@@ -20,6 +19,7 @@ from ccd_casadi.inner_problem.controller_problem import (
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.modal import (
     NOMINAL,
@@ -448,3 +448,21 @@ def box(problem: CoDesignProblem) -> Box:
         In SI.
     """
     return Box(np.array(problem.lower), np.array(problem.upper))
+
+
+def with_options(
+    problem: CoDesignProblem, options: Sequence[tuple[str, object]]
+) -> CoDesignProblem:
+    """Replace some options of a problem's plant.
+
+    Parameters
+    ----------
+    problem, options : CoDesignProblem, sequence of (str, object)
+
+    Returns
+    -------
+    CoDesignProblem
+    """
+    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
+    source: PlantSource = replace(problem.source, options=merged)
+    return replace(problem, source=source)

@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.structure import ParameterKind
+from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, spoken
 

@@ -10,11 +10,11 @@ from ccd_casadi.analysis.motor import DrivenMechanics, MotionAt
 from ccd_casadi.analysis.move import Move, simulate
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
-from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
+from ccd_casadi.fixed_structure.design import SectionsDesign, SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
 from ccd_casadi.fixed_structure.local_search import Envelope, OptimalityOptions
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.objective import InnerValue
@@ -23,11 +23,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
-    structured_of,
     uncertain_plant,
     warm_starts_at,
-    with_structured,
 )
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -9,8 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Structure
-from ccd_casadi.fixed_structure.bounds import ChannelBounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     channel_bounds,
@@ -21,11 +20,17 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.plant_source import PlantSource
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem, of_sensor
-from ccd_casadi.lti.break_point import BreakPoint
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, with_options
+from ccd_casadi.inner_problem.structured_problem import (
+    ChannelProblem,
+    StructuredProblem,
+    of_sensor,
+    structured_of,
+    with_structured,
+)
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -36,21 +41,6 @@ from ccd_casadi.plants.plant import (
 )
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-
-
-def structured_of(problem: CoDesignProblem) -> StructuredProblem:
-    """Take the part of a structured problem that states its controller.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-
-    Returns
-    -------
-    StructuredProblem
-    """
-    assert isinstance(problem.controller, StructuredProblem)
-    return problem.controller
 
 
 def bounds_of(problem: CoDesignProblem) -> Bounds:
@@ -293,24 +283,6 @@ def with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
     )
 
 
-def with_options(
-    problem: CoDesignProblem, options: Sequence[tuple[str, object]]
-) -> CoDesignProblem:
-    """Replace some options of a problem's plant.
-
-    Parameters
-    ----------
-    problem, options : CoDesignProblem, sequence of (str, object)
-
-    Returns
-    -------
-    CoDesignProblem
-    """
-    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
-    source: PlantSource = replace(problem.source, options=merged)
-    return replace(problem, source=source)
-
-
 def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
     """Make the plant set at θ.
 
@@ -326,22 +298,6 @@ def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPl
     uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
     known = [(option, np.array(point)) for option, point in scenarios]
     return uncertain.plants(known or uncertain.corners())
-
-
-def with_structured(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
-    """Change fields of a problem's `StructuredProblem`.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    changes
-        Fields by name.
-
-    Returns
-    -------
-    CoDesignProblem
-    """
-    return replace(problem, controller=replace(structured_of(problem), **changes))  # type: ignore[arg-type]
 
 
 def warm_starts_at(

@@ -9,11 +9,11 @@ Everything is plain values, as in `problem`: it is hashed, sent to workers and k
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.budget.sources import ErrorBudget
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
     FIGURES,
@@ -22,9 +22,13 @@ from ccd_casadi.inner_problem.controller_problem import (
     FigureOfMerit,
     Options,
 )
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
+
+if TYPE_CHECKING:  # that states its controller by this module
+    from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 Scenario = tuple[int, tuple[float, ...]]
 
@@ -186,6 +190,8 @@ class StructuredProblem(ControllerProblem):
                 words = "every one of its channels has a bandwidth_ratio above 1; drop it at the"
                 raise PlantError(f"{words} slowest, whose bandwidth is ω_b")
             if given:
+                from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+
                 channels = [(c.name, c.outputs or (), c.inputs or ()) for c in self.channels]
                 given_decoupling(*(list(part) for part in zip(*channels, strict=True)))
                 if len(found) != p:
@@ -254,3 +260,34 @@ class StructuredProblem(ControllerProblem):
         if self.figure is not BANDWIDTH:
             found["least_error"] = [self.bandwidth_least, self.error_warm_starts]
         return found
+
+
+def structured_of(problem: "CoDesignProblem") -> StructuredProblem:
+    """Take the part of a structured problem that states its controller.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    StructuredProblem
+    """
+    assert isinstance(problem.controller, StructuredProblem)
+    return problem.controller
+
+
+def with_structured(problem: "CoDesignProblem", **changes: object) -> "CoDesignProblem":
+    """Change fields of a problem's `StructuredProblem`.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    changes
+        Fields by name.
+
+    Returns
+    -------
+    CoDesignProblem
+    """
+    return replace(problem, controller=replace(structured_of(problem), **changes))  # type: ignore[arg-type]

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.certificate import JudgeOptions
-from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
+from ccd_casadi.fixed_structure.design import SectionsDesign, SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     Excess,
@@ -34,10 +33,9 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
-    structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results

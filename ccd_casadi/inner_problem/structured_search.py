@@ -10,19 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
 from ccd_casadi.fixed_structure.local_search import OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
-from ccd_casadi.inner_problem.structured_plant_set import (
-    structured_of,
-    uncertain_plant,
-    with_channels,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant, with_channels
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool

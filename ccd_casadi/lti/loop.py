@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
-from ccd_casadi.lti.ports import Ports, ports_of
+from ccd_casadi.lti.ports import BreakPoint, Ports, ports_of
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
     StateSpace,

@@ -90,7 +90,7 @@ def risks(
                      "are not proven on all of it.")  # fmt: skip
     elif not survives.get("robust_set"):
         found.append("The case names no [robust] set: the loop is judged on its model alone.")
-    found += [f"{words[:1].upper()}{words[1:]}." for words in loop_concerns(result)]
+    found += [f"{one.words[:1].upper()}{one.words[1:]}." for one in loop_concerns(result)]
     if (result.get("time_budget") or {}).get("ended"):
         found.append("The search was ended by its time budget: a better design may exist.")
     if "deployable" in result.get("verdict", {}):

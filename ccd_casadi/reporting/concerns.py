@@ -3,11 +3,41 @@ limit, the motor's current, and what must be known of the resonances."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.support.text import inwards, spoken, with_unit
+
+
+class Reason(StrEnum):
+    """Why a decision is not an unconditional yes."""
+
+    LINE_FAILED = "line_failed"
+    LINE_WARNED = "line_warned"
+    LINE_UNKNOWN = "line_unknown"
+    NOT_VERIFIED = "not_verified"
+    MODEL_ALONE = "model_alone"
+    SMALL_ERRORS = "small_errors"
+    SURVIVAL_UNKNOWN = "survival_unknown"
+    SET_UNPROVEN = "set_unproven"
+    SET_SEARCHED = "set_searched"
+    UNSTABLE_CONTROLLER = "unstable_controller"
+    MOVE = "move"
+    CURRENT = "current"
+    LOOP = "loop"
+    BETWEEN_LINES = "between_lines"
+    BUDGET = "budget"
+
+
+@dataclass(frozen=True)
+class Concern:
+    """A reason, in words for this design."""
+
+    reason: Reason
+    words: str
+
 
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
     ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
@@ -131,7 +161,7 @@ def resonance_condition(
 
 def loop_concerns(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
+) -> list[Concern]:
     """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
     and what is narrow or rings near the bandwidth, against the usual limits of the field.
 
@@ -153,13 +183,16 @@ def loop_concerns(
         elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
             late = f"only after {with_unit(1e-3 * settled, 's')}"
             found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
-    found += line_concern(result, options)
-    return [*found, *current_concern(result), *result.get("loop_warnings", ())]
+    own, warned = (
+        [Concern(Reason.LOOP, words) for words in each]
+        for each in (found, result.get("loop_warnings", ()))
+    )
+    return [*own, *line_concern(result, options), *current_concern(result), *warned]
 
 
 def line_concern(
     result: Mapping[str, Any], options: ConcernOptions = ConcernOptions()
-) -> list[str]:
+) -> list[Concern]:
     """What |S| of a measured response may reach between its lines; empty where that is little.
 
     Parameters
@@ -170,19 +203,20 @@ def line_concern(
 
     Returns
     -------
-    list of str
+    list of Concern
     """
     reach = result.get("sensitivity_peak_between_lines")
     if reach is None or reach <= max(1.0, options.between_lines * result["sensitivity_peak"]):
         return []
     where = result.get("sensitivity_peak_between_lines_hz")
     at = "" if where is None else f" about {where:.4g} Hz"
-    return [f"|S| may reach {reach:.3g} between two lines{at}"]
+    words = f"|S| may reach {reach:.3g} between two lines{at}"
+    return [Concern(Reason.BETWEEN_LINES, words)]
 
 
 def current_concern(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
-) -> list[str]:
+) -> list[Concern]:
     """What a move needs beyond the peak current of its motor; empty where it is enough.
 
     Parameters
@@ -193,7 +227,7 @@ def current_concern(
 
     Returns
     -------
-    list of str
+    list of Concern
     """
     move = result.get("move") or {}
     share = move.get("needed_share")
@@ -201,4 +235,4 @@ def current_concern(
         return []
     most = move["needed_current"] / share
     words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
-    return [f"{words}, and peak_current is {most:.4g} A"]
+    return [Concern(Reason.CURRENT, f"{words}, and peak_current is {most:.4g} A")]

@@ -13,10 +13,10 @@ from typing import Any
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions, clauses_of
 from ccd_casadi.drawing.content import VerdictRow
 from ccd_casadi.reporting.concerns import (
-    current_concern,
+    Concern,
+    Reason,
     limited_move,
     limited_move_remedy,
-    line_concern,
     loop_concerns,
     resonance_condition,
 )
@@ -71,33 +71,6 @@ SENTENCES = {
     Build.NOT_VERIFIED: "Do not run this: it is not verified.",
     Build.NOTHING: "",
 }
-
-
-class Reason(StrEnum):
-    """Why a decision is not an unconditional yes."""
-
-    LINE_FAILED = "line_failed"
-    LINE_WARNED = "line_warned"
-    LINE_UNKNOWN = "line_unknown"
-    NOT_VERIFIED = "not_verified"
-    MODEL_ALONE = "model_alone"
-    SMALL_ERRORS = "small_errors"
-    SURVIVAL_UNKNOWN = "survival_unknown"
-    SET_UNPROVEN = "set_unproven"
-    SET_SEARCHED = "set_searched"
-    UNSTABLE_CONTROLLER = "unstable_controller"
-    MOVE = "move"
-    CURRENT = "current"
-    LOOP = "loop"
-    BUDGET = "budget"
-
-
-@dataclass(frozen=True)
-class Concern:
-    """A reason, in words for this design."""
-
-    reason: Reason
-    words: str
 
 
 @dataclass(frozen=True)
@@ -248,16 +221,16 @@ def decide(result: Mapping[str, Any]) -> Decision:
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"
         concerns.append(Concern(Reason.LINE_UNKNOWN, words))
-    concerns += _loop_concerns(result)
+    concerns += loop_concerns(result)
     unjudged = states.get("deployable") == State.UNKNOWN
     condition = resonance_condition(result)
     if not concerns:
         build = Build.AFTER_DEPLOY if unjudged else Build.YES
         return Decision(build, unjudged=unjudged, condition=condition)
-    remedies = {Reason.SET_UNPROVEN: "unproven", Reason.CURRENT: "current",
-                Reason.LOOP: "loop", Reason.BUDGET: "budget"}  # fmt: skip
+    remedies = {Reason.SET_UNPROVEN: "unproven", Reason.CURRENT: "current", Reason.LOOP: "loop",
+                Reason.BETWEEN_LINES: "loop", Reason.BUDGET: "budget"}  # fmt: skip
     present = {one.reason for one in concerns}
-    steps = tuple(NEXT[name] for reason, name in remedies.items() if reason in present)
+    steps = tuple(dict.fromkeys(NEXT[name] for why, name in remedies.items() if why in present))
     return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition)
 
 
@@ -281,23 +254,15 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
     """Of a loop without a verdict: `tune` and baselines."""
     if result.get("status", "verified") != "verified":
         return Decision(Build.NOT_VERIFIED, steps=("see why",))
-    concerns = _loop_concerns(result)
+    concerns = loop_concerns(result)
     if not concerns:
         return Decision(Build.NOTHING)
     step = "a smaller S_max"
-    if [one.words for one in concerns] == line_concern(result):
+    if all(one.reason is Reason.BETWEEN_LINES for one in concerns):
         step = "more lines there, or more averages"
     if all(one.reason is Reason.CURRENT for one in concerns):
         step = NEXT["current"]
-    return Decision(Build.EXAMINE, concerns, (step,))
-
-
-def _loop_concerns(result: Mapping[str, Any]) -> tuple[Concern, ...]:
-    current = current_concern(result)
-    return tuple(
-        Concern(Reason.CURRENT if words in current else Reason.LOOP, words)
-        for words in loop_concerns(result)
-    )
+    return Decision(Build.EXAMINE, tuple(concerns), (step,))
 
 
 def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Concern]:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import NAMES, LoopView
-from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import design_view
@@ -18,6 +17,7 @@ from ccd_casadi.support.text import HZ, display_unit, number, spoken, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
+    from ccd_casadi.cases.run_folder import FinishedRun
     from ccd_casadi.codesign.verified import Verified
 
 UNITS = {"S": "–", "KS": "N/m", "T": "–"}
@@ -48,7 +48,7 @@ def view_of(verified: "Verified") -> LoopView:
     )  # fmt: skip
 
 
-def run_view(run: FinishedRun) -> LoopView:
+def run_view(run: "FinishedRun") -> LoopView:
     """The loop of a finished run over frequency."""
     return design_view(
         run.problem, run.theta, run.controller, weights=run.weights, gamma=run.figures.gamma,

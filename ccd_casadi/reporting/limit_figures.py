@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
-from ccd_casadi.budget import BudgetFigures
 from ccd_casadi.drawing.content import (
     Block,
     Chapter,
@@ -30,6 +29,7 @@ from ccd_casadi.reporting.gain_figures import gain_panels, over_hz, synthesised_
 from ccd_casadi.support.text import HZ, display_unit, spoken
 
 if TYPE_CHECKING:
+    from ccd_casadi.budget.evaluation import BudgetFigures
     from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 
 
@@ -101,7 +101,7 @@ def budget_chapter(
     return [Chapter("Error budget", (*_budget_table(found, found.model), _figure(found.model)))]
 
 
-def _budget_table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
+def _budget_table(found: LoopBudget, model: "BudgetFigures") -> tuple[Words, Table]:
     windowed = model.window is not None
     unit, scale = display_unit(spoken("m"), model.error)
     head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
@@ -119,7 +119,7 @@ def _budget_table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table
     return Words(words), Table(tuple(head), tuple(rows))
 
 
-def _figure(model: BudgetFigures) -> Figure:
+def _figure(model: "BudgetFigures") -> Figure:
     shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
     hz = np.unique(np.concatenate([item.hz for item in shown]))
     parts = [np.interp(hz, item.hz, item.cumulative, left=0.0) for item in shown]

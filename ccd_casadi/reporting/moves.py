@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.motor import Motor, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c
@@ -18,7 +17,6 @@ from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.gain_figures import of_plants
@@ -50,6 +48,8 @@ def move_blocks_of(
     bodies free: without and with feedforward, and a table of plant by feedforward."""
     loops = view.loops
     if problem.source.motion is not None:
+        from ccd_casadi.inner_problem.structured_bandwidth import motion_of
+
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
         name, other = "with feedforward up to snap", ", that of [move]"
@@ -103,6 +103,9 @@ def cycle_chapter(
     own, shown = problem.source.motion, result.get("move")
     if own is None or own.motor is None or not shown:
         return []
+    from ccd_casadi.analysis.motor import Motor, cycle_of
+    from ccd_casadi.inner_problem.structured_bandwidth import motion_of
+
     found, motor = motion_of(problem, theta), own.motor
     profile, forces, settled = found.cycle.profile, found.forward[2], shown["settled_latest"]
     k, R, _ = motor.at(found.mass)

@@ -14,7 +14,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.paint import CSS, block_html
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.deployment.realisation import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
@@ -46,16 +44,11 @@ from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_blocks_of
 from ccd_casadi.reporting.nyquist import bode
 from ccd_casadi.reporting.run_verdict import publish, run_head
-from ccd_casadi.reporting.structured_page import (
-    bandwidths_table,
-    binding_words,
-    controller_blocks,
-    limits_blocks,
-)
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Progress
 
 if TYPE_CHECKING:  # solve imports this module
+    from ccd_casadi.cases.run_folder import FinishedRun
     from ccd_casadi.codesign.verified import Solution
 
 ORDER = (
@@ -102,7 +95,7 @@ def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "So
     return c.Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
 
 
-def page_of_run(run: FinishedRun) -> c.Page:
+def page_of_run(run: "FinishedRun") -> c.Page:
     """Make the report of a run that kept none, as far as its folder holds it: the design alone.
 
     Parameters
@@ -141,7 +134,11 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
         return []
     own, theta, view = verified.problem, verified.theta, view_of(verified)
     parts = design_parts(problem, own, theta, view, result)
-    if isinstance(verified, VerifiedStructured):
+    if "proof" in result:  # of a fixed structure
+        from ccd_casadi.codesign.verified_structured import VerifiedStructured
+        from ccd_casadi.reporting.structured_page import bandwidths_table
+
+        assert isinstance(verified, VerifiedStructured)
         table = bandwidths_table(verified)
         parts["loop"] = lambda: _loop(own, theta, view, table)
     elif isinstance(verified, VerifiedDesign):
@@ -173,9 +170,13 @@ def design_parts(
         "budget": lambda: budget_chapter(own, theta, view.loop.controller),
         "loop": lambda: _loop(own, theta, view),
     }
-    if "proof" in result:  # of a fixed structure
+    if "proof" in result:
+        from ccd_casadi.reporting.structured_page import controller_blocks
+
         parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
     if "costs" in result:
+        from ccd_casadi.reporting.structured_page import limits_blocks
+
         limits = "What limits the bandwidth"
         parts["limits"] = lambda: [c.Chapter(limits, limits_blocks(problem, result))]
     return parts
@@ -189,13 +190,16 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
-    structured = "proof" in result
-    rows = facts("structured" if structured else "design", problem, result)
-    binds = (binding_words if structured else binding)(problem, result)
+    if "proof" in result:
+        from ccd_casadi.reporting.structured_page import binding_words
+
+        rows, bound = facts("structured", problem, result), binding_words(problem, result)
+    else:
+        rows, bound = facts("design", problem, result), binding(problem, result)
     body = (
         theta_table(problem, result),
         c.Heading("What binds"),
-        c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
+        c.Bullets(tuple(bound)) if bound else c.Words("Nothing binds: an interior optimum."),
         *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
         c.FoldedBlocks("All figures of the design", (c.Facts(tuple(rows)),)),
     )

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import SectionWords
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.reporting.facts import binding, gain_words, paragraph
 from ccd_casadi.support.text import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
@@ -57,7 +57,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
                 worth = v.shown(0.01 * mu[name] * most, 3)
                 more = f"1 % more of it gives {worth} on this hardware"
                 over_kappa.append(f"{words}{of} binds; {more}.")
-    ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
+    ranges = [key.rpartition(" ") for key in result["controller"]["at_range"]]
     ends = [f"{name if ': ' in name else name[:1].upper() + name[1:]} is at the {end} end of its "
             "range." for name, _, end in ranges]  # fmt: skip
     return [*over_theta, *over_kappa, *ends]

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import dataclass
 
-from ccd_casadi.analysis.move_limits import LIMITS, MoveLimits
+from ccd_casadi.analysis import LIMITS, MoveLimits
 from ccd_casadi.support.options import positive, valued
 
 

@@ -22,9 +22,9 @@ from ccd_casadi.codesign.survival import (
 )
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import free_modal, plant_of
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sensitivity, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import mechanics

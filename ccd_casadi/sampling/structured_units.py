@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.inner_problem.objective import objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.store import Sample

@@ -1,16 +1,25 @@
 """The units of every kind of inner problem."""
 
+from collections.abc import Callable
+
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.sampling.structured_units import StructuredUnits
 from ccd_casadi.sampling.units import InnerUnits, MixedUnits, Unit
 from ccd_casadi.support.process_pool import Pool
 
+
+def _structured() -> InnerUnits:
+    """Imported where a problem has such a controller."""
+    from ccd_casadi.sampling.structured_units import StructuredUnits
+
+    return StructuredUnits()
+
+
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
-UNITS: dict[type[ControllerProblem], InnerUnits] = {
-    MixedSensitivityProblem: MixedUnits(),
-    StructuredProblem: StructuredUnits(),
+UNITS: dict[type[ControllerProblem], Callable[[], InnerUnits]] = {
+    MixedSensitivityProblem: MixedUnits,
+    StructuredProblem: _structured,
 }
 
 
@@ -25,7 +34,7 @@ def units_of(problem: CoDesignProblem) -> InnerUnits:
     -------
     InnerUnits
     """
-    return UNITS[type(problem.controller)]
+    return UNITS[type(problem.controller)]()
 
 
 def inner_unit(

@@ -15,7 +15,6 @@ import numpy as np
 import scipy
 
 from ccd_casadi.support.errors import MissingPackage, UserError
-from ccd_casadi.support.mat_hdf5 import hdf5_variables
 from surrogates.files import write_whole
 
 
@@ -44,6 +43,8 @@ def mat_variables(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
     except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
         try:
+            from ccd_casadi.support.mat_hdf5 import hdf5_variables
+
             return hdf5_variables(path)
         except MissingPackage as error:
             raise UserError(f"{path}: is a MATLAB 7.3 file: {error}; or write it with save(…, "

@@ -71,13 +71,13 @@ class TimeBudget:
         return bool(self.left)
 
     @property
-    def words(self) -> str:
-        """Of a search that it ended: what was left; empty of another."""
+    def clauses(self) -> tuple[str, ...]:
+        """Of a search that it ended: what was left; none of another."""
         if not self.ended:
-            return ""
+            return ()
         left = ", ".join(counted(count, name) for name, count in self.left.items())
         words = f"the search ended with its budget of {self.minutes:g} min, not searched: {left}"
-        return f"{words}; a larger --budget continues from what is stored"
+        return words, "a larger --budget continues from what is stored"
 
     @property
     def entry(self) -> dict[str, object]:

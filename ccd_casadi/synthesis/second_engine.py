@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import slycot
 
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import root_flanks
 from ccd_casadi.lti.loop import Sampling, in_w, sampled, tustin
 from ccd_casadi.lti.norms import gains
+from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, balanced, closed_loop, weighted
 from ccd_casadi.support.errors import described
 from ccd_casadi.support.text import counted

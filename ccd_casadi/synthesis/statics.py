@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.lti.break_point import BreakPoint
 from ccd_casadi.lti.frequency_grid import refine_peak
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.norms import gains, hinf_norm
-from ccd_casadi.lti.ports import Ports
+from ccd_casadi.lti.ports import BreakPoint, Ports
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from oracles.case_documents import TWO_MASS
 
-from ccd_casadi.budget import ShapedSpectrum, SourceKind, TabulatedSpectrum
 from ccd_casadi.budget.error_density import integrate
+from ccd_casadi.budget.sources import ShapedSpectrum, SourceKind, TabulatedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_to_toml

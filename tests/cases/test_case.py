@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from oracles.case_documents import DROP, PLANT, TWO_MASS, edited, message
 
-from ccd_casadi.cases import plant_tables
+from ccd_casadi.cases import DRAWING, SAMPLING, is_searched, plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.first_look import DRAWING, SAMPLING, is_searched
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.inner_problem.problem import plant_of

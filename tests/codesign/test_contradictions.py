@@ -16,10 +16,11 @@ from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.lti.loop import Sampling
 
 
 def boxed(case: CoDesignProblem, rng: np.random.Generator) -> CoDesignProblem:

@@ -13,8 +13,8 @@ from oracles.helpers import few, problem
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.local_search import Envelope
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.optim.kkt import KktCertificate

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.codesign.requirements import _plant_words
+from ccd_casadi.codesign.verified_structured import _plant_words
 from ccd_casadi.reporting.facts import requirement_lines, requirements_table
 
 

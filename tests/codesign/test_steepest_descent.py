@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles.helpers import problem
 
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.studies import steepest_descent as module

@@ -25,9 +25,8 @@ from ccd_casadi.codesign.survival import (
     survival,
 )
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import RobustSet
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant

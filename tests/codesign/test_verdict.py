@@ -24,14 +24,14 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.result_entries import kept_words, robust_dict
 from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.structured_entries import kept_words, robust_dict
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import multistart_words
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
-from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RobustSet
 from ccd_casadi.inner_problem.objective import TrueQuantities

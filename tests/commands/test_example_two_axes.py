@@ -12,15 +12,16 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.result_entries import active_of, design_dict
+from ccd_casadi.codesign.structured_entries import active_of, design_dict
 from ccd_casadi.codesign.theta_kkt import theta_kkt
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.pipeline import require_own_bounds
-from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.fixed_structure import Sampling, SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.local_search import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.reporting.facts import channel_words
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.errors import UserError

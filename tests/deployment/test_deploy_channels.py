@@ -18,11 +18,11 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.deploy_files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment, deployed_line
 from ccd_casadi.deployment.pipeline import _judged, deploy
 from ccd_casadi.deployment.robust_set import as_written, members
-from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant

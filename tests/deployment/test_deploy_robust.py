@@ -11,10 +11,10 @@ import pytest
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.given_controller import with_controller
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import DeploymentOptions, deploy
-from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import closed_loop

@@ -13,7 +13,7 @@ import pytest
 from oracles.integer_controller import IntegerController, driven
 from scipy import signal
 
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.fixed_point import FixedRequest, Ranges, in_fixed
 from ccd_casadi.deployment.integer_loop import rounding_bound

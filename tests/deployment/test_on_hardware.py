@@ -16,8 +16,8 @@ from oracles.sampled_simulation import simulate
 from oracles.structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
 from ccd_casadi.deployment.on_hardware import (
     BACK,

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import held_setpoint, simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.extensions.feedforward.feedforward_files import (

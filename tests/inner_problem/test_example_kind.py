@@ -24,7 +24,8 @@ from ccd_casadi.codesign.run import OUTERS, solve
 from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
-from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
+from ccd_casadi.inner_problem.inner_kind import InnerKind
+from ccd_casadi.inner_problem.kinds import KINDS
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
@@ -164,7 +165,7 @@ class RuleOuter(ThetaOuter):
 @pytest.fixture
 def case() -> Iterator[CoDesignProblem]:
     """The two masses with this kind, which only these tests know."""
-    tables: list[tuple[dict, Any]] = [(KINDS, ByRule), (UNITS, RuleUnits()), (OUTERS, RuleOuter)]
+    tables: list[tuple[dict, Any]] = [(KINDS, ByRule), (UNITS, RuleUnits), (OUTERS, RuleOuter)]
     for table, entry in tables:
         table[RuleOfThumb] = entry
     yield problem(controller=RuleOfThumb(), inner=replace(INNER, S_max=2.5, S_low=0.3), w1=0.05)

@@ -23,7 +23,7 @@ from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.extensions.measured.measured_answer import measured_answer
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem

@@ -9,9 +9,9 @@ from oracles import random_moves as moves
 from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.motor import Motion, MotionAt, MotionOptions, Motor, cycle_of, with_motion
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -31,7 +31,8 @@ from ccd_casadi.plants.plant import (
     hardware_slopes,
     mechanics,
 )
-from ccd_casadi.reporting.decision import advice, current_concern
+from ccd_casadi.reporting.concerns import current_concern
+from ccd_casadi.reporting.decision import advice
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
@@ -300,7 +301,7 @@ def test_a_run_counts_what_feedforward_and_feedback_need_of_the_current() -> Non
     needed = max(entry["feedforward_force"], *(run.peak_force.max() for run in runs))
     assert entry["needed_force"] == pytest.approx(max(needed, entry["peak_force"]), rel=1e-3)
     short = {"status": "verified", "move": entry | {"needed_share": 1.2, "needed_current": 12.0}}
-    assert current_concern(short) == [
+    assert [one.words for one in current_concern(short)] == [
         "the move needs 12 A with feedforward and feedback, and peak_current is 10 A"
     ]
     assert "a larger peak_current" in advice(short)

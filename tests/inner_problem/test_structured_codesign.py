@@ -17,24 +17,27 @@ from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.design import SectionsDesign
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import (
+    StructuredProblem,
+    Uncertainty,
     structured_of,
-    uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 from ccd_casadi.inner_problem.structured_robustness import (
     BoxCheckOptions,
     DesignOnBox,
     certify_corners,
 )
 from ccd_casadi.inner_problem.structured_search import StructuredSearchOptions, prepared, with_range
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError

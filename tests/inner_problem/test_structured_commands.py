@@ -14,7 +14,7 @@ from oracles.case_documents import QUICK_SECTIONS as QUICK
 from oracles.contradictions import contradictions
 from oracles.helpers import problem
 
-from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -22,18 +22,19 @@ from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.post_optimal import structured_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.extensions.feedforward.feedforward_command import main as feedforward_main
 from ccd_casadi.extensions.feedforward.move_responses import Shape, responses_of
 from ccd_casadi.extensions.limitations.gap_command import main as gap_main
 from ccd_casadi.extensions.limitations.limits import discs
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
 from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners
-from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value

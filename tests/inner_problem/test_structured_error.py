@@ -11,7 +11,7 @@ from oracles.case_documents import TWO_MASS
 from oracles.helpers import HZ
 from oracles.kinds import CABLES, SLOW, least
 
-from ccd_casadi.budget import ErrorBudget, ShapedSpectrum
+from ccd_casadi.budget.sources import ErrorBudget, ShapedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import Direct
@@ -19,11 +19,11 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.stored_searches import with_initial_search
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

@@ -15,8 +15,7 @@ from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem import structured_search
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.inner_problem.structured_problem import Uncertainty
+from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     channel_bounds,
@@ -24,7 +24,9 @@ from ccd_casadi.fixed_structure.figures import (
     to_theta,
 )
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopCurve, LoopProblem
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import loop_grid, loop_point
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

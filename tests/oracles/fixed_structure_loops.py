@@ -4,13 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_point import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant

@@ -22,10 +22,11 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import synthesise_sections
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values

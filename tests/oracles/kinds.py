@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
-from ccd_casadi.budget import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.budget.sources import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.lti.loop import Sampling
 from oracles.helpers import HZ, problem
 
 PID = StructuredProblem(

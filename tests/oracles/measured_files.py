@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.text import HZ
 from oracles.case_documents import SECTIONS_TABLES

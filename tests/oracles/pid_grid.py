@@ -25,7 +25,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Structure, synthesise_sections
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.registry import two_mass

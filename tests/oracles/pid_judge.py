@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.fixed_structure import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics
 

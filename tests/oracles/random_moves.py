@@ -20,15 +20,15 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import eigh, expm
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
-from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant

@@ -39,16 +39,23 @@ import numpy as np
 
 from ccd_casadi.extensions.limitations.bound import forbids
 from ccd_casadi.extensions.limitations.limits import limits_of
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import JudgeOptions
-from ccd_casadi.fixed_structure.design import DesignOptions, DesignSearch, problem_for
+from ccd_casadi.fixed_structure.design import (
+    DesignOptions,
+    DesignSearch,
+    SectionsDesign,
+    problem_for,
+)
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner

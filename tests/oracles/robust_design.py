@@ -5,16 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import (
-    Bounds,
-    Sampling,
-    SectionsDesign,
-    SetCertificate,
-    Structure,
-    synthesise,
-)
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise
+from ccd_casadi.fixed_structure.design import SectionsDesign
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     Excess,
@@ -23,6 +19,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
     lattice,
     worst_plants,
 )
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 3  # plants added in one round

@@ -7,7 +7,7 @@ by Tustin's difference equation.
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 
 

@@ -10,8 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.design import SectionsDesign
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.loop import Sampling
 
 HZ = 2.0 * np.pi
 

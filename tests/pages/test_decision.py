@@ -9,8 +9,8 @@ from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.reporting.brief_risks import risks
-from ccd_casadi.reporting.concerns import ConditionOptions, resonance_condition
-from ccd_casadi.reporting.decision import Build, Reason, advice, decide
+from ccd_casadi.reporting.concerns import ConditionOptions, Reason, resonance_condition
+from ccd_casadi.reporting.decision import Build, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.formulation import FormulationRound
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.deployment.outcome import against, deployed_line
 from ccd_casadi.deployment.robust_set import MemberLoop
-from ccd_casadi.fixed_structure import ShapeEnd
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem

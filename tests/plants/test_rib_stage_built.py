@@ -13,7 +13,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_files import sections_kappa
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
 from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.structured_plant_set import structure_of

@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from oracles.helpers import few, random_plant
 
+from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import mass_feedforward, simulate
-from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.lti.loop import Loop, Sampling

@@ -82,3 +82,15 @@ def test_kernels_are_compiled_while_other_packages_are_installed() -> None:
     words += f"\nimport json, sys; print(json.dumps(sorted({later} & set(sys.modules))))"
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout.splitlines()[-1]) == []
+
+
+def test_a_solve_of_full_order_imports_no_search_of_sections() -> None:
+    """What belongs to another kind, to moves or to lists is imported where it is dispatched."""
+    other = (
+        "codesign.catalogue", "codesign.outer_structured", "fixed_structure.local_search",
+        "inner_problem.structured_search", "sampling.structured_units", "analysis.motor",
+        "cases.run_folder", "budget.evaluation",
+    )  # fmt: skip
+    words = "import sys, ccd_casadi.codesign.run, ccd_casadi.reporting.solve_page\n"
+    words += f"found = {{'ccd_casadi.' + name for name in {other}}} & set(sys.modules)\n"
+    subprocess.run([sys.executable, "-c", f"{words}assert not found, found"], check=True)

@@ -28,7 +28,8 @@ from ccd_casadi.extensions.schedule.segments import (
     share_of,
     within,
 )
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError

@@ -10,7 +10,10 @@ from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.analysis.loop_warnings import LoopWarningOptions, bandwidth_dip, dip_of
-from ccd_casadi.fixed_structure import ShapeEnd, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.text import HZ
 

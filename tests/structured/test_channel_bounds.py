@@ -20,23 +20,21 @@ from oracles.fixed_structure_channels import (
 )
 from oracles.helpers import HZ, SUSPENSION, few, scaled
 
-from ccd_casadi.fixed_structure import (
-    Bounds,
-    Sampling,
-    SectionsDesign,
-    Structure,
-    certify,
-    synthesise,
-)
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     channel_bounds,
     given_decoupling,
 )
 from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -11,16 +11,14 @@ from oracles.fixed_structure_loops import FAST, LATE, SLOW, loop, plant
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from ccd_casadi.budget import (
-    ErrorBudget,
-    ErrorSource,
-    ShapedSpectrum,
-    SourceKind,
-    TabulatedSpectrum,
-    evaluate_budget,
-)
 from ccd_casadi.budget.error_density import integrated
-from ccd_casadi.budget.evaluation import COMPLEX_STEP, ErrorVariance, of_source, variances
+from ccd_casadi.budget.evaluation import (
+    COMPLEX_STEP,
+    ErrorVariance,
+    evaluate_budget,
+    of_source,
+    variances,
+)
 from ccd_casadi.budget.noise_process import (
     Process,
     average_gain,
@@ -29,8 +27,15 @@ from ccd_casadi.budget.noise_process import (
     process,
     run_matrix,
 )
-from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.lti.loop import Loop, delay_parts
+from ccd_casadi.budget.sources import (
+    ErrorBudget,
+    ErrorSource,
+    ShapedSpectrum,
+    SourceKind,
+    TabulatedSpectrum,
+)
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Loop, Sampling, delay_parts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 

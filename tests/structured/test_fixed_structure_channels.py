@@ -23,7 +23,6 @@ from oracles.fixed_structure_channels import (
 )
 from oracles.helpers import sensitivity_gain
 
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     Decoupling,
@@ -36,6 +35,7 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import Brackets, assess, constraints, hessians, split
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.errors import PlantError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,22 +8,21 @@ import pytest
 from oracles.fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
 from oracles.helpers import HZ, SUSPENSION, random_plant, responses, two_mass_model
 
-from ccd_casadi.fixed_structure import (
-    Bounds,
-    Sampling,
+from ccd_casadi.fixed_structure import certificate
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, certify, judged
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
+from ccd_casadi.fixed_structure.design import (
     SectionsOutcome,
-    ShapeEnd,
-    Structure,
-    certificate,
-    certify,
-    synthesise_sections,
+    bandwidth_envelope,
+    in_problem_units,
+    problem_for,
 )
-from ccd_casadi.fixed_structure.certificate import JudgeOptions, judged
-from ccd_casadi.fixed_structure.design import bandwidth_envelope, in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, optimality
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     LoopOnBox,
@@ -32,6 +31,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
     lattice,
     worst_plants,
 )
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics

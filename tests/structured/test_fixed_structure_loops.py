@@ -19,7 +19,7 @@ from oracles.fixed_structure_loops import (
 
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.certificate_curves import grid_through
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
@@ -34,8 +34,9 @@ from ccd_casadi.fixed_structure.figures import (
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, RowPlaces
 from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import sections
-from ccd_casadi.lti.loop import in_w, sampled
+from ccd_casadi.lti.loop import Sampling, in_w, sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import PlantError

@@ -9,18 +9,20 @@ import pytest
 from oracles.fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
 from oracles.helpers import HZ, two_mass_model
 
-from ccd_casadi.codesign.result_entries import bound_words
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
+from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
-from ccd_casadi.fixed_structure.bounds import key_words
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.fixed_structure.worst_plant import lattice
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.support.arrays import Array
 

@@ -9,16 +9,19 @@ import pytest
 from oracles.fixed_structure_loops import WEIGHTS
 from oracles.helpers import HZ
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.affine import Affine
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes

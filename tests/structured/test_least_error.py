@@ -9,7 +9,7 @@ import pytest
 from oracles.case_documents import TWO_MASS
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
-from ccd_casadi.budget import (
+from ccd_casadi.budget.sources import (
     ErrorBudget,
     ErrorSource,
     ShapedSpectrum,
@@ -18,9 +18,12 @@ from ccd_casadi.budget import (
 )
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import Structure, certify, local_search, synthesise_sections
 from ccd_casadi.fixed_structure import least_value as module
+from ccd_casadi.fixed_structure import local_search
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.least_value import RmsError, least_value
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.text import HZ
 

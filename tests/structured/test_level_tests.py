@@ -11,9 +11,12 @@ from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 from scipy.linalg import block_diag
 
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
-from ccd_casadi.fixed_structure import Sampling, Structure, certificate, certify
+from ccd_casadi.fixed_structure import certificate
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE, Proof, ProofOutcome
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.synthesis.second_engine import SecondEngineOptions, compared, second_opinion

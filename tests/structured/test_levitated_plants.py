@@ -14,13 +14,16 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.codesign.result_entries import IsoZones, iso_entry
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
-from ccd_casadi.fixed_structure import synthesise_sections as synthesise
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, axis_of
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.discs import discs_of
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics

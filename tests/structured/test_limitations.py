@@ -40,10 +40,10 @@ from ccd_casadi.extensions.limitations.of_problem import (
     none_reaches,
     opposite_corners,
 )
-from ccd_casadi.fixed_structure import Bounds, Sampling
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import scale_state_space

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.fixed_structure_loops import FAST, LATE, loop, plant
 
+from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import (
     LoopFigureOptions,
     largest_force_step,
@@ -16,10 +17,9 @@ from ccd_casadi.analysis.loop_figures import (
 )
 from ccd_casadi.analysis.loop_warnings import light_roots, ringing, second_crossover
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.lti.loop import Loop, tustin
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Loop, Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.closed_loop import classical_margins
 

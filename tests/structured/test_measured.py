@@ -13,9 +13,13 @@ from scipy.io import savemat
 from ccd_casadi.extensions.measured.line_problem import line_problem
 from ccd_casadi.extensions.measured.measured_design import design_on_data
 from ccd_casadi.extensions.measured.measured_loop import judge, winding
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import in_problem_units
 from ccd_casadi.fixed_structure.local_search import LoopModel
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.support.errors import UserError

@@ -7,16 +7,18 @@ import pytest
 from oracles.fixed_structure_loops import BOUNDS, LATE, WEIGHTS
 from oracles.helpers import HZ
 
-from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
-from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, given_decoupling
 from ccd_casadi.fixed_structure.discs import RankOneDiscs, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array

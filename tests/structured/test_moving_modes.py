@@ -8,11 +8,13 @@ import pytest
 from oracles.fixed_structure_loops import LATE, WEIGHTS
 from oracles.helpers import HZ, SUSPENSION
 
-from ccd_casadi.fixed_structure import Bounds, Structure, certify
 from ccd_casadi.fixed_structure.affine import moving_modes, outputs, variable
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.plants.modal import modal_plant

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracles import pid_grid
 
-from ccd_casadi.fixed_structure import synthesise_sections
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import scale_plant

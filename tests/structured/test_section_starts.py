@@ -7,7 +7,7 @@ import pytest
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 from oracles.helpers import HZ, scaled, two_mass
 
-from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
@@ -21,6 +21,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     started,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.plants.plant import Mechanics
 
 SMALL = Structure(biquads=1, roll_off=2)

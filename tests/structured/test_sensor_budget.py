@@ -8,13 +8,13 @@ import pytest
 from oracles.two_encoders import DELAY, RATE, THETA, axis, by_hand, held
 from scipy.linalg import expm, matrix_balance, solve_discrete_lyapunov
 
-from ccd_casadi.budget import (
+from ccd_casadi.budget.evaluation import evaluate_budget
+from ccd_casadi.budget.sources import (
     ErrorBudget,
     ErrorSource,
     ShapedSpectrum,
     SourceKind,
     TabulatedSpectrum,
-    evaluate_budget,
 )
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result_entries import budget_entry, move_entry

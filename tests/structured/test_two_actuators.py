@@ -11,14 +11,21 @@ from oracles.fixed_structure_channels import BOUNDS, FAST, assert_derivatives, p
 from scipy.linalg import block_diag
 from scipy.signal import cont2discrete
 
-from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.channel_structure import find_decoupling, given_decoupling
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    find_decoupling,
+    given_decoupling,
+)
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.starts import actuator_starts
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import PlantError

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve
 
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, axis_of
 from ccd_casadi.fixed_structure.discs import discs_of
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.lti.wiring import Filters, Wiring
 from ccd_casadi.plants.as_written import as_written

@@ -9,12 +9,14 @@ from oracles.sampled_loop import sampled_loop
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, synthesise_sections
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.plant_set import plant_set
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.wiring import Filters, Wiring
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, modal_plant

@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
 from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
@@ -17,12 +17,11 @@ from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
 from ccd_casadi.extensions.explorer.designs import ExploredDesign, Standing
 from ccd_casadi.extensions.explorer.notch import Notched
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.frequency_grid import frequency_grid
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.gain_figures import gain_panels

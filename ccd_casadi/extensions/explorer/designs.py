@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verdict import VerdictOptions
 from ccd_casadi.extensions.explorer.knobs import Knobs
-from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -25,7 +25,8 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     scaled_system,
 )
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds

@@ -20,13 +20,8 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
-    structured_of,
-    uncertain_plant,
-)
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem, structured_of
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz

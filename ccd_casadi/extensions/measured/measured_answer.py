@@ -7,11 +7,11 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.inner_answer import InnerAnswer
-from ccd_casadi.codesign.result_entries import sections_controller
+from ccd_casadi.codesign.structured_entries import sections_controller
 from ccd_casadi.extensions.measured.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.extensions.measured.measured_loop import controller_response
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import equivalent_open_loop
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ

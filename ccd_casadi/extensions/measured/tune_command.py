@@ -43,9 +43,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.measured.measured_page import measured_page
     from ccd_casadi.extensions.measured.present_controller import present_loop
     from ccd_casadi.extensions.measured.tuning import tune
-    from ccd_casadi.fixed_structure import Structure
-    from ccd_casadi.inner_problem.kinds import FixedStructure
+    from ccd_casadi.fixed_structure.structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.inner_problem.structured_kind import FixedStructure
     from ccd_casadi.lti.loop import tustin
     from ccd_casadi.reporting.decision import advice
     from ccd_casadi.reporting.facts import loop_lines

@@ -29,7 +29,8 @@ import numpy as np
 
 from ccd_casadi.extensions.schedule.segments import Segment, within
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array

@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     )
     from ccd_casadi.extensions.schedule.schedule_page import schedule_page
     from ccd_casadi.extensions.schedule.segments import ScheduleOptions, scheduled_name, segments_of
-    from ccd_casadi.inner_problem.structured_plant_set import structured_of
+    from ccd_casadi.inner_problem.structured_problem import structured_of
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.sampled_figures import loop_figures
-from ccd_casadi.codesign.result_entries import proof_dict, sections_controller
+from ccd_casadi.codesign.structured_entries import proof_dict, sections_controller
 from ccd_casadi.deployment.realisation import literal, literals
 from ccd_casadi.extensions.schedule.handover import (
     CrossingOptions,
@@ -19,12 +19,8 @@ from ccd_casadi.extensions.schedule.handover import (
 from ccd_casadi.extensions.schedule.segments import Alone, ScheduleOptions, Segment, refined, within
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
-    structured_of,
-    uncertain_plant,
-)
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.support.arrays import Array

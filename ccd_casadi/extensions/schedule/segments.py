@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import (
+    StructuredProblem,
     structured_of,
-    uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared, search_starts, with_range
 from ccd_casadi.support.errors import UserError

@@ -9,18 +9,18 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
-from ccd_casadi.codesign.result_entries import design_dict, sections_controller
 from ccd_casadi.codesign.run import within
+from ccd_casadi.codesign.structured_entries import design_dict, sections_controller
 from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
 from ccd_casadi.extensions.tolerances.tolerance_case import ToleranceCase
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.plants.plant import hardware_cost

@@ -20,18 +20,17 @@ import numpy as np
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.extensions.tolerances.machines import Machine, Plan, Trial, drawn
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
-    structure_of,
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import (
+    Scenario,
+    Uncertainty,
     structured_of,
-    uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario, Uncertainty
 from ccd_casadi.inner_problem.structured_search import prepared, with_warm_start
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler

@@ -26,7 +26,7 @@ from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.extensions.tolerances.machines import tolerance_of
 from ccd_casadi.extensions.tolerances.prices import redesigned
 from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
