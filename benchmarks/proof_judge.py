@@ -3,7 +3,7 @@
     python benchmarks/proof_judge.py [--draws N] [--climbs N] [--option I] [--mutants] [--bare]
         [--most N]
 
-The design is that of benchmarks/rib_stage_design. `prove` is required to show stability and |S|,
+The design is that of runs/rib_stage_built.toml. `prove` is required to show stability and |S|,
 |KS|, |T| and |GS| within 1.05 of their bounds (`--bare`: |S| alone) on the box of every option:
 each flexible mode ±2 % by itself, damping × 0.5 to 2, up to 25 parameters. Then NumPy alone (its
 own hold and delay of each mode, K by Tustin's rule) looks for the largest figures in random

@@ -82,6 +82,10 @@ def test_documented_parameters_are_those_of_the_signature() -> None:
     assert wrong == {}
 
 
+def test_what_another_room_uses_says_what_it_takes_and_returns() -> None:
+    assert structure.undocumented(structure.trees(structure.OURS)) == []
+
+
 # Words of conversation that name nothing; each has a term of the field.
 NO_NAMES = {"told", "asked", "look", "looks", "looked", "bent", "begun", "race", "raced", "stands"}
 

@@ -229,11 +229,20 @@ def _unsorted(real: float, imaginary: float) -> bool:
 
 @dataclass(frozen=True)
 class SourceFigures:
-    """One source: RMS error, MA, MSD (m; NaN without a window) and RMS force (N).
+    """What one source adds.
 
-    `disagreement` (relative) is between Lyapunov's equation and the integral over frequency, or
-    for a table the error estimate of the quadrature. `hz` and `cumulative` (m²): the variance of
-    the error up to each frequency. Infinite where white noise passes undamped.
+    Attributes
+    ----------
+    source : ErrorSource
+    error, average, deviation : float
+        RMS error, MA and MSD in m; the last two NaN without a window.
+    force : float
+        RMS, N.
+    disagreement : float
+        Relative: between Lyapunov's equation and the integral over frequency, or for a table the
+        error estimate of the quadrature. Infinite where white noise passes undamped.
+    hz, cumulative : array (k,)
+        The variance of the error in m² up to each frequency.
     """
 
     source: ErrorSource
@@ -248,7 +257,16 @@ class SourceFigures:
 
 @dataclass(frozen=True)
 class BudgetFigures:
-    """All sources and their root sum of squares: error, MA and MSD in m, force in N."""
+    """All sources and their root sum of squares.
+
+    Attributes
+    ----------
+    sources : tuple of SourceFigures
+    error, average, deviation, force : float
+        m, m, m, N.
+    window : float or None
+        s.
+    """
 
     sources: tuple[SourceFigures, ...]
     error: float
@@ -264,10 +282,24 @@ class BudgetFigures:
 
 
 def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
-    """The budget of a loop in SI, plant without feedthrough.
+    """Evaluate the budget of a loop in SI, plant without feedthrough.
 
-    With several channels errors and forces are those of the vectors. None for a loop that is not
-    stable, which has no stationary error. Raises UserError for a plant with a feedthrough.
+    With several channels errors and forces are those of the vectors.
+
+    Parameters
+    ----------
+    loop : Loop
+    budget : ErrorBudget
+
+    Returns
+    -------
+    BudgetFigures or None
+        None for a loop that is not stable, which has no stationary error.
+
+    Raises
+    ------
+    UserError
+        The plant has a feedthrough.
 
     >>> import numpy as np
     >>> from ccd_casadi.budget import ErrorBudget, SourceKind, ShapedSpectrum, ErrorSource

@@ -25,10 +25,19 @@ Corner = tuple[float, ...]  # (Hz,) of a real root, (Hz, damping ratio) of a pai
 
 @dataclass(frozen=True)
 class TabulatedSpectrum:
-    """S at rising frequencies in Hz; S ~ f^β between two of them, 0 outside.
+    """S at given frequencies; S ~ f^β between two of them, 0 outside.
 
-    Raises ValueError for fewer than two points, frequencies that do not rise, or values of S
-    that are not above 0.
+    Attributes
+    ----------
+    hz : tuple of float
+        Rising, two or more.
+    density : tuple of float
+        Above 0.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two points, frequencies that do not rise, or values of S that are not above 0.
     """
 
     hz: tuple[float, ...]
@@ -239,7 +248,14 @@ class ErrorSource:
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Independent sources, and the window in s of moving average and standard deviation."""
+    """Independent sources of error.
+
+    Attributes
+    ----------
+    sources : tuple of ErrorSource
+    window : float or None
+        Of moving average and standard deviation, s.
+    """
 
     sources: tuple[ErrorSource, ...]
     window: float | None = None

@@ -408,7 +408,18 @@ def survives(
 
 
 def deployable(survival: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
-    """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
+    """Write the line `deployable` before `deploy`.
+
+    Parameters
+    ----------
+    survival : Survival or None
+    sampling : Sampling or None
+
+    Returns
+    -------
+    VerdictLine
+        Whether it is designed as it runs, or what delay its margins leave.
+    """
     figures: dict[str, float] = {}
     if survival is not None:
         figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}

@@ -22,20 +22,48 @@ from ccd_casadi.support.process_pool import Pool, results
 
 @dataclass(frozen=True)
 class BoxProofOptions:
-    """Numbers of the proof on a box; slacks are relative."""
+    """Numbers of the proof on a box; slacks are relative.
 
-    slack: float = 1e-3  # by how much a bound may be exceeded in what is proven
-    slack_of_many: float = 0.05  # that of several channels or more than `few_parameters`
+    Attributes
+    ----------
+    slack : float
+        By how much a bound may be exceeded in what is proven.
+    slack_of_many : float
+        That of several channels or more than `few_parameters`.
+    few_parameters : int
+        Up to which a box has few parameters.
+    most_boxes : int
+        Of all options; some twenty seconds.
+    most_boxes_of_many : int
+        Of each option, with several channels or many parameters.
+    stuck_boxes_of_many : int
+        Those after which such a proof gives up if it is stuck.
+    stuck_share : float
+        Of its boxes open: it would take many times as many to close them.
+    batch : int
+        Boxes that are divided at a time, at most.
+    batches : int
+        At least, so that little is spent on the worst boxes alone.
+    decades : float
+        Of frequency cells at the start; below them is one cell to 0.
+    poles_apart : float
+        Of actuators and sensors behind a hold, relative: or no proof.
+    unit_frequency : float
+        Over ω_b and the fastest pole: above it cells divide 1/ω.
+    """
+
+    slack: float = 1e-3
+    slack_of_many: float = 0.05
     few_parameters: int = 4
-    most_boxes: int = 500_000  # of all options; some twenty seconds
-    most_boxes_of_many: int = 250_000  # of each option, with several channels or many parameters
-    stuck_boxes_of_many: int = 45_000  # those after which such a proof gives up if it is stuck
-    stuck_share: float = 0.25  # of its boxes open: it would take many times as many to close them
-    batch: int = 2_000  # boxes that are divided at a time, at most
-    batches: int = 250  # at least, so that little is spent on the worst boxes alone
-    decades: float = 6.0  # of frequency cells at the start; below them is one cell to 0
-    poles_apart: float = 1e-4  # of actuators and sensors behind a hold, relative: or no proof
-    unit_frequency: float = 3.0  # over ω_b and the fastest pole: above it cells divide 1/ω
+    most_boxes: int = 500_000
+    most_boxes_of_many: int = 250_000
+    stuck_boxes_of_many: int = 45_000
+    stuck_share: float = 0.25
+    batch: int = 2_000
+    batches: int = 250
+    decades: float = 6.0
+    poles_apart: float = 1e-4
+    unit_frequency: float = 3.0
 
 
 @dataclass(frozen=True)

@@ -99,12 +99,21 @@ class ChannelFigures(ChannelPeaks):
 class PlantFigures(LoopPeaks):
     """One plant's loop in SI; NaN where it is unstable.
 
-    `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
-    `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
-    `static_compliance` is GS towards 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
-    `GS_beyond`: rad/s of a resonance beyond half the rate where |GS| is largest; 0: it is below.
-    `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peaks by Hamiltonians.
-    `channels`: as those of the bounds.
+    Attributes
+    ----------
+    stable : bool
+    stability : float
+        The largest real part of a pole in 1/s; sampled the spectral radius less 1.
+    crossing, bandwidth : float
+        The first -3 dB of S, and the largest ω_b that the shape allows, rad/s.
+    static_compliance, low_compliance : float
+        GS towards 0 Hz, 0 with an integrator; at ω_low, m/N.
+    GS_beyond : float
+        rad/s of a resonance beyond half the rate where |GS| is largest; 0: it is below.
+    confirmed : bool
+        S's peaks by Hamiltonians.
+    channels : tuple of ChannelFigures
+        As those of the bounds.
     """
 
     stable: bool

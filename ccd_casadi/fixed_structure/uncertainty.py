@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.boxes import Pair
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.as_written import as_written
-from ccd_casadi.plants.first_order import FirstOrder
+from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import (
     FREE,
     ModalPlant,
@@ -170,7 +170,7 @@ class UncertainPlant:
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
         return scale_plant(moved, self.M_K, bare=True)
 
-    def _to_point(self, states: FirstOrder, values: Array) -> FirstOrder:
+    def _to_point(self, states: FirstOrderPlant, values: Array) -> FirstOrderPlant:
         """A plant of first order with derivatives to the point; see `sloped`."""
         system, first = states.system, len(self.names) - len(self.ranges)
         rows = [

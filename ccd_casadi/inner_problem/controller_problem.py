@@ -113,7 +113,13 @@ class ControllerProblem:
 
 @dataclass(frozen=True)
 class MixedSensitivityProblem(ControllerProblem):
-    """An H∞ controller by the weights W_S, W_KS and W_T: the problem states all of it."""
+    """An H∞ controller by the weights W_S, W_KS and W_T: the problem states all of it.
+
+    Attributes
+    ----------
+    kernels : tuple of str
+        Groups of compiled kernels that it needs.
+    """
 
     kernels: ClassVar[tuple[str, ...]] = ("synthesis",)
 

@@ -49,7 +49,7 @@ class FirstOrderOptions:
     defective: float = 1e10
 
 
-class Modes(NamedTuple):
+class FirstOrderModes(NamedTuple):
     """Poles in the words of mechanics: s² + damping s + stiffness, of a free body both 0."""
 
     stiffness: Array
@@ -61,7 +61,7 @@ class Modes(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FirstOrder:
+class FirstOrderPlant:
     """The state space with its poles at 0 apart, SI.
 
     Attributes
@@ -110,7 +110,7 @@ class FirstOrder:
             power = A @ power
         return C @ power
 
-    def suspended(self, omega: float, damping_ratio: float) -> "FirstOrder":
+    def suspended(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
         """The same with free bodies held by springs of ω in rad/s, or integrators by a leak. Raises
         PlantError where it has both, whose states at rest are not one alone."""
         n, r = self.bodies, self.at_rest
@@ -151,12 +151,12 @@ class FirstOrder:
         """Which poles (r, r) are one."""
         return np.abs(self.rates - self.rates[:, None]) <= 1e-9 * np.abs(self.rates)
 
-    def driven(self, gain: float) -> "FirstOrder":
+    def driven(self, gain: float) -> "FirstOrderPlant":
         """With B times a factor."""
         slopes = self.slopes._replace(dB=gain * self.slopes.dB)
         return replace(self, system=replace(self.system, B=gain * self.system.B), slopes=slopes)
 
-    def off(self, shift: float, damping: float, single: Sequence[float]) -> "FirstOrder":
+    def off(self, shift: float, damping: float, single: Sequence[float]) -> "FirstOrderPlant":
         """Off the model, with the derivatives that it has there; see the head of the module."""
         if not shift and damping == 1.0 and not any(single):
             return self
@@ -201,7 +201,7 @@ class FirstOrder:
         dB[r:] = -(self.V * (on / (1.0 + value)) @ self.W @ self.system.B[r:]).real
         return dA, dB
 
-    def modes(self, *, options: FirstOrderOptions = FirstOrderOptions()) -> Modes:
+    def modes(self, *, options: FirstOrderOptions = FirstOrderOptions()) -> FirstOrderModes:
         """Free bodies, complex pairs and real poles as modes; single integrators are none.
 
         A pair's residue is N₁ s + N₀, of which N₀ is taken; a real pole p is s² + 2|p| s + p²,
@@ -223,7 +223,7 @@ class FirstOrder:
         sizes = np.linalg.norm(drive, axis=1), np.linalg.norm(reading, axis=0)
         seen = (sizes[0] > 0.0) & (sizes[1] > 0.0)
         even = np.sqrt(np.divide(sizes[0], sizes[1], out=np.ones(len(drive)), where=seen))
-        return Modes(
+        return FirstOrderModes(
             np.concatenate([np.zeros(n), np.abs(own) ** 2, -sign * p**2]),
             np.concatenate([np.zeros(n), decay, np.where(p < 0.0, -2.0 * p, 0.0)]),
             drive / even[:, None],
@@ -236,7 +236,7 @@ class FirstOrder:
 def first_order(
     A: Array, B: Array, C: Array, slopes: Slopes, *,
     options: FirstOrderOptions = FirstOrderOptions(),
-) -> FirstOrder:  # fmt: skip
+) -> FirstOrderPlant:  # fmt: skip
     """Part the poles at 0 of a state space from the others.
 
     Parameters
@@ -249,7 +249,7 @@ def first_order(
 
     Returns
     -------
-    FirstOrder
+    FirstOrderPlant
 
     Raises
     ------
@@ -283,7 +283,7 @@ def first_order(
     light = np.abs(lam[upper].real) < options.resonant * size[upper]
     order = np.lexsort((size[upper], ~light))
     moved = Slopes(back @ slopes.dA @ T, back @ slopes.dB, slopes.dC @ T)
-    return FirstOrder(
+    return FirstOrderPlant(
         strictly_proper(A, B, C), moved, n, k, lam, V, np.linalg.inv(V) if len(lam) else V,
         tuple(upper[order].tolist()), int(light.sum()),
     )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import UNWIRED, Slopes, Wiring
-from ccd_casadi.plants.first_order import FirstOrder, first_order
+from ccd_casadi.plants.first_order import FirstOrderPlant, first_order
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered, placed
 from ccd_casadi.support.arrays import Array
@@ -115,7 +115,7 @@ class ModalPlant:
         Derivatives to θ, leading axis θ.
     wiring : Wiring
         What lies before the forces and behind the sensors.
-    states : FirstOrder, optional
+    states : FirstOrderPlant, optional
         The plant itself where its function gives A, B, C; all above then describes its poles.
     """
 
@@ -132,7 +132,7 @@ class ModalPlant:
     dB: Array
     dC: Array
     wiring: Wiring = UNWIRED
-    states: FirstOrder | None = None
+    states: FirstOrderPlant | None = None
 
     @property
     def driven_away(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.state_space import StateSpace, balanced, state_scales, strictly_proper
 from ccd_casadi.lti.wiring import Slopes
-from ccd_casadi.plants.first_order import FirstOrder
+from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -315,7 +315,9 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
 
 
-def _scaled_states(modal: ModalPlant, states: FirstOrder, M_K: float, bare: bool) -> ScaledPlant:
+def _scaled_states(
+    modal: ModalPlant, states: FirstOrderPlant, M_K: float, bare: bool
+) -> ScaledPlant:
     """A plant of first order; ω₀ as `scale_state_space` has it, free bodies alike."""
     system, n, r = states.system, states.bodies, states.at_rest
     omega_0 = _unit_of_frequency(system, M_K)
