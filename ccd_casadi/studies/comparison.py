@@ -121,10 +121,14 @@ def _descent(
         "stop": run["stop"],
         "last_gradient": run["history"][-1]["gradient"],
     }
+    above = f"{gap:.3g} above" if gap > 0.0 else "the same" if gap == 0.0 else f"{-gap:.3g} below"
+    many = f"{ratio:.0f} times as many" if ratio >= 1.5 else f"{ratio:.2g} times as many"
+    took = "1 synthesis" if run["syntheses"] == 1 else f"{run['syntheses']} syntheses"
+    many = "as many" if run["syntheses"] == best["syntheses_to_optimum"] else many
     words = [
         f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
-        f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
-        f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
+        f"{run['objective']:.4f}, {above}, after {took}, "
+        f"{many}; all its runs together took {run['syntheses_of_all_runs']}."
     ]
     if gap > equal * abs(best["objective"]):
         words.append(
