@@ -271,7 +271,7 @@ def distinct_texts(values: Sequence[float], digits: int = 4) -> list[str]:
 
     Examples
     --------
-    >>> told_apart([0.2402, 0.2391, 0.23]), told_apart([288.571, 288.574])
+    >>> distinct_texts([0.2402, 0.2391, 0.23]), distinct_texts([288.571, 288.574])
     (['0.2402', '0.2391', '0.23'], ['288.571', '288.574'])
     """
     found: list[str] = []
