@@ -31,6 +31,7 @@ from ccd_casadi.plants.modal import (
     require_damping,
 )
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
+from ccd_casadi.plants.plant_facts import facts_of
 from ccd_casadi.plants.registry import two_mass
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.support.errors import PlantError
@@ -279,3 +280,16 @@ def test_a_case_of_first_order_has_the_controller_of_the_same_mechanics(
         found.append(json.loads(capsys.readouterr().out))
     assert found[1]["status"] == "verified"
     assert found[1]["bandwidth_hz"] == pytest.approx(found[0]["bandwidth_hz"], rel=0.02)
+
+
+def test_a_real_pole_is_no_resonance_and_an_undamped_zero_has_no_sign() -> None:
+    """A coil before a mass on a spring beside a free body, without damping."""
+    masses = np.array([[0.0, 0, 1, 0], [0, 0, 0, 1], [-9, 9, 0, 0], [9, -9, 0, 0]])
+    A = block_diag(masses, [[-5.0]])
+    A[2, 4] = 1.0
+    modal = modal_plant(mechanics(model_of(A=A, B=np.eye(5)[:, 4:], C=np.eye(1, 5)), (0.5,)), FREE)
+    facts = facts_of((0.5,), modal, scale_plant(modal, 1e3))
+    assert [mode.real for mode in facts.modes] == [False, False, True]
+    assert [mode.resonant for mode in facts.modes] == [False, True, False]
+    assert [zero.damping_ratio for zero in facts.zeros] == [0.0]
+    assert facts.zeros[0].frequency_hz == pytest.approx(3.0 / (2.0 * np.pi))
