@@ -118,7 +118,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         if found.stable:
             moved = on_hardware(
                 finished.loop.plant, found.realisation, found.delay,
-                finished.figures.bandwidth, limits=move_limits(options), window=options.window,
+                finished.bandwidth, limits=move_limits(options), window=options.window,
                 hardware=electronics, places=kind.bounds().places,
                 ports=finished.loop.ports if finished.loop.ported else None,
                 progress=lambda words: bar.advance(note=words),

@@ -149,7 +149,7 @@ def diagnose(
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
             here += [
-                *_driven_away(found, place),
+                *_driven_away(found, modal.states is not None, place),
                 *_hidden(modal, place, options),
                 *zero_findings(found, problem.inner.S_max, place),
             ]
@@ -297,13 +297,16 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
     return found
 
 
-def _driven_away(facts: PlantFacts, place: str) -> list[Finding]:
+def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[Finding]:
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if not growth:
         return []
+    what, meant = "the stiffness drives", "a spring was meant, correct the sign of stiffness"
+    if of_states:
+        what, meant = "A drives", "that is not meant, correct its signs"
     words = (
-        f"the stiffness drives a motion away {place}: an unstable pole at +{growth:.4g} Hz, which "
-        "the loop has to be faster than; if a spring was meant, correct the sign of stiffness"
+        f"{what} a motion away {place}: an unstable pole at +{growth:.4g} Hz, which "
+        f"the loop has to be faster than; if {meant}"
     )
     return [Finding(Severity.NOTE, Topic.UNSTABLE, words)]
 

@@ -108,11 +108,11 @@ def zero_findings(
 ) -> list[Finding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
-    right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
+    right = [zero for zero in facts.zeros if zero.damping_ratio < 0.0]
     if right:
         found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
     return found + [
-        _dip(zero, place) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < options.light
+        _dip(zero, place) for zero in facts.zeros if 0.0 <= zero.damping_ratio < options.light
     ]
 
 

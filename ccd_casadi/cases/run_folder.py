@@ -139,6 +139,14 @@ class FinishedRun(NotebookHtml):
         plant = self.plant if wide is self.problem else scaled_plant(wide, self.theta)
         return self.loop_on(plant.plant_si())
 
+    @cached_property
+    def bandwidth(self) -> float:
+        """ω_b in rad/s of the continuous loop; where that has none, of the sampled one."""
+        loop = self.loop_on(self.plant.plant_si())
+        if loop.sampling is None or np.isfinite(self.figures.bandwidth):
+            return self.figures.bandwidth
+        return loop_figures(closed_loop(*loop.as_run), loop.at).bandwidth
+
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""
         return _measured(self.problem, plant, controller, self.weights)

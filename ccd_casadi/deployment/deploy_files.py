@@ -325,4 +325,4 @@ def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
 def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
     if item.designed is not None:
         return sections_dict(*item.designed)
-    return asdict(sections_of(item.chosen.controller, run.figures.bandwidth))
+    return asdict(sections_of(item.chosen.controller, run.bandwidth))

@@ -171,7 +171,7 @@ def choose(
 
     Raises UserError where no rate is given and none will do.
     """
-    bandwidth_hz = run.figures.bandwidth / HZ
+    bandwidth_hz = run.bandwidth / HZ
     conversion = Conversion.LEAD if timing.lead else Conversion.RAMP
     again = f", once more for a plant in between ({attempt})" if attempt else ""
     progress(f"rate for {conversion.value}{again}")

@@ -332,12 +332,14 @@ def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str
     rows = []
     for name, figures in (*loops, ("Sampled", found.sampled)):
         if figures is not None and isfinite(figures.bandwidth):
-            change = 100.0 * (figures.bandwidth / run.figures.bandwidth - 1.0)
+            change = 100.0 * (figures.bandwidth / run.bandwidth - 1.0)
             peak = against(figures.sensitivity_peak, run.problem.inner.S_max)
             words = f"peak {figures.sensitivity_peak:.6g} ({peak})"
             if loops and figures is not run.figures:
                 words += f", bandwidth {round(change, 2) + 0.0:+.2f} %"
             rows.append((name, f"{figures.bandwidth / HZ:.6g} Hz", words))
+    if not run.figures.certificate.stable:
+        rows.append(("Continuous", "unknown", "unstable without its sampling, which stabilises it"))
     return rows
 
 

@@ -221,7 +221,8 @@ def deploy(
         No sampling rate is enough, or the given one is no rate for this loop.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
-    if not np.isfinite(full.bandwidth):
+    own = run.bandwidth
+    if not np.isfinite(own):
         fastest = float(np.abs(np.linalg.eigvals(K.A)).max(initial=0.0)) / HZ
         words = f"no bandwidth was measured of its loop ({full.outcome.value})"
         raise UserError(
@@ -229,22 +230,22 @@ def deploy(
             "lies far above the loop, such as a stiff link"
         )
     designed, family, dense = run.problem.sampling, members(run), members(run, dense=True)
-    target = Target(inner.S_max, options.sampled_excess, full.bandwidth, options.sampled_bandwidth)
+    target = Target(inner.S_max, options.sampled_excess, own, options.sampled_bandwidth)
     if kind_of(run.problem).as_designed:
         require_own_bounds(run, designed, timing)
-        limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
+        limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, own), DESIGN_FOR_IT
         places = kind_of(run.problem).bounds().places
         orders, channels, small = designed_channels(run), whole_loop(run.plant, K, places), [K]
         reduced, figures = K, full
     else:
         least = options.least_rate
-        if timing.rate_hz is not None and timing.rate_hz < least * full.bandwidth / HZ:
-            words = f"is less than {least:g} times the bandwidth, {full.bandwidth / HZ:.4g} Hz"
+        if timing.rate_hz is not None and timing.rate_hz < least * own / HZ:
+            words = f"is less than {least:g} times the bandwidth, {own / HZ:.4g} Hz"
             raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
         remedy = SHORTEN_IT
         limits = LoopLimits(
             options.reduced_peak * inner.S_max, inner.S_low * (1.0 + options.strict),
-            options.reduced_norm * full.gamma, options.reduced_bandwidth * full.bandwidth,
+            options.reduced_norm * full.gamma, options.reduced_bandwidth * own,
         )  # fmt: skip
         orders = tuple(
             _orders(run, c, family, limits, progress, options)
@@ -361,7 +362,7 @@ def _assessed(
     Behind every plant are a hold of a period and a delay in s. `way`: what else was found of the
     reduction and the rate, by the fields of `Deployment`.
     """
-    period, bandwidth = 1.0 / rate_hz, run.figures.bandwidth
+    period, bandwidth = 1.0 / rate_hz, run.bandwidth
     places = kind_of(run.problem).bounds().places
     parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
     realisation = with_anti_windup(

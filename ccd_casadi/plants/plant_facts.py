@@ -24,7 +24,8 @@ from ccd_casadi.support.text import HZ
 class PlantMode:
     """One mode of the undamped plant; driven and measured: its gains over the largest.
 
-    Where the stiffness drives it away it has no resonance and grows as exp(2π `growth_hz` t).
+    Where the stiffness drives it away it has no resonance and grows as exp(2π `growth_hz` t). It
+    is `real` where it is one real pole of a plant of first order, as of a coil.
     """
 
     frequency_hz: float
@@ -33,11 +34,12 @@ class PlantMode:
     driven: float
     measured: float
     growth_hz: float = 0.0
+    real: bool = False
 
     @property
     def resonant(self) -> bool:
-        """Whether K resists it."""
-        return not self.rigid and not self.growth_hz
+        """Whether it swings, or would if it were damped less: K resists it."""
+        return not (self.rigid or self.growth_hz or self.real)
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,9 @@ def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
     zeta = np.where(resonant, d / (2.0 * np.sqrt(np.where(resonant, k, 1.0))), 0.0)
     away = np.minimum(k, 0.0)  # s² + d s + k = 0
     growth = np.where(away < 0.0, np.sqrt(0.25 * d**2 - away) - 0.5 * d, 0.0) / HZ
-    columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max(), growth)
+    swings = len(k) if modal.states is None else modal.states.bodies + len(modal.states.pairs)
+    real = (np.arange(len(k)) >= swings) & (k > 0.0)
+    columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max(), growth, real)
     return tuple(map(PlantMode, *(column.tolist() for column in columns)))
 
 
@@ -143,7 +147,7 @@ def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
     return float(np.exp(x[0] - y[0] * (x[1] - x[0]) / (y[1] - y[0])) * plant.omega_0 / HZ)
 
 
-def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
+def _zeros(plant: ScaledPlant, effort_hz: float, *, rounding: float = 1e-9) -> tuple[Zero, ...]:
     """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
     limit = 3.0 * effort_hz * HZ / plant.omega_0
     x, y = np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
@@ -154,7 +158,7 @@ def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
             continue
         gain = np.exp(np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), x, y))
         dip = gain[1] / np.sqrt(gain[0] * gain[2])
-        damping = -zero.real / size
+        damping = -zero.real / size if abs(zero.real) > rounding * size else 0.0
         hz = float(size * plant.omega_0 / HZ)
         found.append(Zero(hz, float(damping), float(dip)))
     return tuple(sorted(found, key=lambda zero: zero.frequency_hz))

@@ -95,6 +95,8 @@ def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, s
     """The loops beside each other: name, colour, line; nothing is reduced of what was designed."""
     G, K, at = run.plant.plant_si(), found.realisation.system, kind_of(run.problem).bounds().places
     sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay), at), "sampled", ORANGE, "-"
+    if not run.figures.certificate.stable:
+        return (sampled,)
     if kind_of(run.problem).as_designed:
         return (Loop(G, run.controller, at=at), "continuous", BLUE, "-"), sampled
     full = Loop(G, run.controller), "full", BLUE, "-"
@@ -119,7 +121,7 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
         curves.append(c.Curve(hz, S, f"broken at {one.at[0].name}", colour))
     S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
     crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
-        bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
+        bandwidth_level(run.bandwidth / HZ, text=", as designed")
     )  # fmt: skip
     of_S = "|S|" if kind_of(run.problem).bounds().places else named.format("S")
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{of_S} (–)")
@@ -139,7 +141,7 @@ def _step(run: FinishedRun, found: Deployment) -> c.Figure:
     direction = found.orders[0].channel.outputs[:, 0]
     if at := kind_of(run.problem).bounds().places:  # a setpoint of the one whose error counts
         direction = np.ones(1)
-    seconds = PERIODS * HZ / run.figures.bandwidth
+    seconds = PERIODS * HZ / run.bandwidth
     curves = []
     for loop, label, colour, line in _loops(run, found):
         t, outputs = step_response(loop, direction, seconds, POINTS)
@@ -178,7 +180,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
         structure, kappa = item.designed
         words = _words("designed", item.channel, gain_of(kappa))
         return *words, structured_table(section_words(structure, kappa))
-    found = sections_of(K, run.figures.bandwidth)
+    found = sections_of(K, run.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )

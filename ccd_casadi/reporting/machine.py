@@ -128,7 +128,8 @@ def modes_table(modal: ModalPlant) -> Table:
         known = (f"{number(mode.frequency_hz, 4)}\u00a0Hz", f"{100.0 * mode.damping_ratio:.3g} %")
         if not mode.resonant:
             grows = f"driven away, pole at +{number(mode.growth_hz, 4)}\u00a0Hz"
-            known = ("rigid" if mode.rigid else grows, "")
+            lies = f"real pole, {known[0]}" if mode.real else grows
+            known = ("rigid" if mode.rigid else lies, "")
         rows.append((*known, f"{mode.driven:.2g}", f"{mode.measured:.2g}"))
     return Table(("mode", "damping", "driven (most: 1)", "measured (most: 1)"), tuple(rows))
 

@@ -2,15 +2,22 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.drive import main
+from ccd_casadi.extensions.drives import drive_codesign
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
 from ccd_casadi.extensions.drives.cascade_search import Search
 from ccd_casadi.extensions.drives.drive_case import DriveProblem, drive_problem
-from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
+from ccd_casadi.extensions.drives.drive_codesign import (
+    DriveAt,
+    DriveCodesignOptions,
+    codesign_drive,
+)
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, first_points, plants_at
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
@@ -68,3 +75,24 @@ def test_no_start_is_said() -> None:
 def test_theta_is_fixed_or_searched(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(EXAMPLE), "--theta", "load=0.0771", "--codesign"]) == 2
     assert "give one of both" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("least", "there_is"), [(0.0785, True), (0.09, False)])
+def test_a_start_that_breaks_a_constraint_is_no_answer(
+    least: float, there_is: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where J is smallest there: the cascades are not searched here, J = f(θ)."""
+    text = (EXAMPLE.parent / "plant.py").read_text("utf-8")
+    held = f'"constraints": {{"heavy": {least} - load}}'
+    (tmp_path / "plant.py").write_text(text.replace('"constraints": {}', held), "utf-8")
+    drive = drive_problem(parse_case(read_toml(EXAMPLE), tmp_path / "case.toml"))
+
+    def designed(drive: DriveProblem, theta: tuple[float, ...], *rest: Any) -> DriveAt:
+        return DriveAt(theta, theta[0], theta[0], SimpleNamespace(bandwidth=1.0), 1.0)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(drive_codesign, "_designed", designed)
+    if there_is:
+        assert codesign_drive(drive)[1].theta[0] >= least - 1e-6
+        return
+    with pytest.raises(UserError, match="meets the constraints"):
+        codesign_drive(drive)

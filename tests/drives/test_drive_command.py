@@ -30,6 +30,7 @@ def changed(**tables: dict[str, Any]) -> dict[str, Any]:
         ({"drive": {"filters": 5}}, "has 4 filters of the current"),
         ({"drive": {"velocity": "spindle"}}, "one of motor, load"),
         ({"drive": {"position_rate_hz": 3000.0}}, "no whole part of loop.rate_hz"),
+        ({"drive": {"position_rate_hz": 2.0}}, "at most twice inner.omega_low_hz"),
         ({"controller": {"compliance_max": 1e-5}}, "compliance_max"),
     ],
 )

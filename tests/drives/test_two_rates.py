@@ -123,6 +123,16 @@ def test_of_one_sensor_both_paths_are_broken() -> None:
     np.testing.assert_allclose(slower, one[:5], rtol=0.2)  # half a period of 125 µs at 10 to 33 Hz
 
 
+def test_of_one_sensor_S_low_is_of_the_sine_and_not_of_its_aliases() -> None:
+    own = replace(cascade(), position=0, velocity=0, sensors=1, slower=2)
+    plant = replace(PLANT, C=PLANT.C[:1], D=PLANT.D[:1])
+    limits = bounds(4.0, S_low=0.3, channels=(), error=None)
+    found = judge_two_rates(own, SLOW, [plant], limits, RATE)
+    system = sampled(plant, RATE.period, RATE.delay)
+    fast = lift(replace(own, slower=1), SLOW, system).fundamental(0, np.array([limits.omega_low]))
+    assert found.worst["S_LOW"] == pytest.approx(abs(fast[0]) / 0.3, rel=0.1)
+
+
 def test_what_is_exceeded_is_named() -> None:
     own = replace(cascade(), slower=4)
     good = judge_two_rates(own, SLOW, [PLANT], bounds(4.0, S_low=0.9), RATE)

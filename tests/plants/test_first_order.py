@@ -17,6 +17,7 @@ from oracles.helpers import few
 from scipy.linalg import block_diag
 
 from ccd_casadi import inner
+from ccd_casadi.cases.diagnosis import _driven_away
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Filters, Wiring
@@ -31,6 +32,7 @@ from ccd_casadi.plants.modal import (
     require_damping,
 )
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
+from ccd_casadi.plants.plant_facts import PlantFacts, PlantMode, facts_of
 from ccd_casadi.plants.registry import two_mass
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.support.errors import PlantError
@@ -279,3 +281,23 @@ def test_a_case_of_first_order_has_the_controller_of_the_same_mechanics(
         found.append(json.loads(capsys.readouterr().out))
     assert found[1]["status"] == "verified"
     assert found[1]["bandwidth_hz"] == pytest.approx(found[0]["bandwidth_hz"], rel=0.02)
+
+
+def test_what_drives_a_motion_away_is_named_as_it_is_given() -> None:
+    facts = PlantFacts((0.5,), (PlantMode(0.0, 0.0, False, 1.0, 1.0, 2.0),), (), np.nan)
+    words = [_driven_away(facts, first, "at the start")[0].words for first in (False, True)]
+    assert "stiffness" in words[0]
+    assert "stiffness" not in words[1]
+
+
+def test_a_real_pole_is_no_resonance_and_an_undamped_zero_has_no_sign() -> None:
+    """A coil before a mass on a spring beside a free body, without damping."""
+    masses = np.array([[0.0, 0, 1, 0], [0, 0, 0, 1], [-9, 9, 0, 0], [9, -9, 0, 0]])
+    A = block_diag(masses, [[-5.0]])
+    A[2, 4] = 1.0
+    modal = modal_plant(mechanics(model_of(A=A, B=np.eye(5)[:, 4:], C=np.eye(1, 5)), (0.5,)), FREE)
+    facts = facts_of((0.5,), modal, scale_plant(modal, 1e3))
+    assert [mode.real for mode in facts.modes] == [False, False, True]
+    assert [mode.resonant for mode in facts.modes] == [False, True, False]
+    assert [zero.damping_ratio for zero in facts.zeros] == [0.0]
+    assert facts.zeros[0].frequency_hz == pytest.approx(3.0 / (2.0 * np.pi))

@@ -19,6 +19,7 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_p
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.text import HZ
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             filters += there[:count]
         position, velocity, count = _sensors(bounds, table.velocity)
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
-                          table.filter_gain, _slower(table, problem.sampling))  # fmt: skip
+                          table.filter_gain,
+                          _slower(table, problem.sampling, bounds.omega_low))  # fmt: skip
         uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
     except CaseError:
         raise
@@ -84,7 +86,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
     return DriveProblem(problem, cascade, uncertain, bounds, problem.sampling)
 
 
-def _slower(table: DriveTable, sampling: Sampling) -> int:
+def _slower(table: DriveTable, sampling: Sampling, omega_low: float) -> int:
     """Instants of the loop's rate to one of the position's."""
     if table.position_rate_hz is None:
         return 1
@@ -93,6 +95,9 @@ def _slower(table: DriveTable, sampling: Sampling) -> int:
     if slower < 1 or abs(ratio - slower) > 1e-9 * ratio:
         words = f"position_rate_hz is {table.position_rate_hz:g}, no whole part of loop.rate_hz"
         raise UserError(f"{words}; give {sampling.rate_hz:g} over 1, 2, 3, ...")
+    if HZ * table.position_rate_hz <= 2.0 * omega_low:
+        words = f"position_rate_hz is {table.position_rate_hz:g}, at most twice inner.omega_low_hz"
+        raise UserError(f"{words}, below which a loop has to act; give it in Hz, and larger")
     return slower
 
 

@@ -104,7 +104,8 @@ def codesign_drive(
     Raises
     ------
     UserError
-        No cascade meets the bounds at the start, or J counts another figure than ω_b.
+        No cascade meets the bounds at the start, no θ that was tried meets the constraints, or J
+        counts another figure than ω_b.
     """
     problem = drive.problem
     require_bandwidth(problem, "ccd drive --codesign")
@@ -118,7 +119,7 @@ def codesign_drive(
     free = [i for i, name in enumerate(problem.names)
             if name not in listed and problem.upper[i] > problem.lower[i]]  # fmt: skip
     lower, upper = np.array(problem.lower)[free], np.array(problem.upper)[free]
-    tried = 0
+    tried, allowed = 0, _met(problem, problem.start, options)
     for chosen in itertools.product(*lists):
 
         def theta_of(share: Array, chosen: Sequence[float] = chosen) -> tuple[float, ...]:
@@ -128,15 +129,16 @@ def codesign_drive(
             return tuple(theta)
 
         def objective(share: Array, theta_of=theta_of) -> float:  # type: ignore[no-untyped-def]
-            nonlocal best, tried
+            nonlocal best, tried, allowed
             theta = theta_of(share)
             found = _designed(drive, theta, best, seed, options)
             tried += 1
             if (
                 found is not None
-                and found.objective < best.objective
+                and (found.objective < best.objective or not allowed)
                 and _met(problem, theta, options)
             ):
+                allowed = True
                 best = found
                 progress(f"{tried} theta: J {number(best.objective, 6)}, "
                          f"{number(best.candidate.bandwidth / HZ, 4)} Hz")  # fmt: skip
@@ -155,6 +157,8 @@ def codesign_drive(
                  constraints=[limits] if plant_of(problem).constraint_names else [],
                  options={"maxfev": options.evaluations, "initial_tr_radius": options.first,
                           "final_tr_radius": options.last})  # fmt: skip
+    if not allowed:
+        raise UserError(f"no theta of {tried} tried meets the constraints; start nearer to one")
     return first, best
 
 

@@ -238,9 +238,9 @@ def _figures(
         key = f"S_MAX of {name}" if name else "S_MAX"
         shares[key] = float(found.max()) / own.get(name, bounds.S_max)
         S = found if place == cascade.position else S
-    shares["S_LOW"] = float(S[np.searchsorted(omega, bounds.omega_low)]) / bounds.S_low
     peak, peak_at = float(S.max()), float(omega[S.argmax()])
-    S = np.abs(loop.fundamental(cascade.position, omega))
+    S = np.abs(loop.fundamental(cascade.position, omega))  # the radius is of all aliases of ω
+    shares["S_LOW"] = float(S[np.searchsorted(omega, bounds.omega_low)]) / bounds.S_low
     below = omega < np.pi / (cascade.slower * cascade.period)  # above it the position is aliased
     crossed = np.flatnonzero(2.0 * S**2 > 1.0)
     crossing = float(omega[crossed[0]]) if len(crossed) else top
