@@ -301,11 +301,12 @@ def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[Finding
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if not growth:
         return []
-    what, meant = "the stiffness drives", "a spring was meant, correct the sign of stiffness"
+    what = "the stiffness drives a motion away"
+    meant = "a spring was meant, correct the sign of stiffness"
     if of_states:
-        what, meant = "A drives", "that is not meant, correct its signs"
+        what, meant = "A drives a motion away", "that is not meant, correct its signs"
     words = (
-        f"{what} a motion away {place}: an unstable pole at +{growth:.4g} Hz, which "
+        f"{what} {place}: an unstable pole at +{growth:.4g} Hz, which "
         f"the loop has to be faster than; if {meant}"
     )
     return [Finding(Severity.NOTE, Topic.UNSTABLE, words)]

@@ -31,6 +31,7 @@ from ccd_casadi.extensions.feedforward.learning import (
 )
 from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTimeOptions, least_time
 from ccd_casadi.extensions.feedforward.move_responses import MoveResponses, Shape, responses_of
+from ccd_casadi.extensions.feedforward.set_feedforward import FeedforwardSetOptions, _shapes
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -299,3 +300,16 @@ def test_a_margin_of_the_window_is_kept() -> None:
     assert found[1] is not None
     assert found[0].time <= found[1].time
     assert found[1].left <= 0.5 * 1.001
+
+
+@pytest.mark.parametrize(("samples", "count"), [(1000, True), (5, False)])
+def test_taps_are_of_resonances_and_within_the_move(samples: int, count: bool) -> None:
+    """A real pole of a plant of first order, which is slow, has no period."""
+    modal = SimpleNamespace(K=np.diag([100.0**2, 0.01]), numbered=np.array([0]), rigid=np.zeros(2))
+    sampling = Sampling(1000.0, 0.0)
+    run = SimpleNamespace(modal=lambda: modal, loop=SimpleNamespace(sampling=sampling), folder="")
+    shapes = _shapes(cast(FinishedRun, run), Shape((2,), 1), 4, samples, FeedforwardSetOptions())
+    assert (len(shapes) > 1) == count
+    period = 2.0 * np.pi / 100.0 * sampling.rate_hz
+    assert all(one.last <= 1.1 * max(FeedforwardSetOptions().spreads) * period for one in shapes)
+    assert all(one.last < samples for one in shapes)

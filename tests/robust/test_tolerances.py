@@ -18,7 +18,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.deployment.robust_set import members
-from ccd_casadi.extensions.tolerances import answers, widths
+from ccd_casadi.extensions.tolerances import answers, share_search, widths
 from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, Trial, drawn
 from ccd_casadi.extensions.tolerances.prices import scaled
 from ccd_casadi.extensions.tolerances.share_certificate import (
@@ -26,7 +26,7 @@ from ccd_casadi.extensions.tolerances.share_certificate import (
     certified_share,
     judged,
 )
-from ccd_casadi.extensions.tolerances.share_search import ShareOptions, ShareSearch
+from ccd_casadi.extensions.tolerances.share_search import NoDesign, ShareOptions, ShareSearch
 from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
 from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, promised
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
@@ -379,3 +379,26 @@ def _is_a_run_of_its_kept_set(folder: Path, capsys: pytest.CaptureFixture[str]) 
         (folder / "result.json").write_text(json.dumps(result))
         with pytest.raises(UserError, match=words):
             read_run(folder, of_share=True)
+
+
+def test_a_search_starts_again_from_the_whole_box_where_its_own_controller_is_unstable(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The fast controller of the model alone is stable on no other machine."""
+    for name in ("with_warm_start", "with_structured"):
+        monkeypatch.setattr(share_search, name, lambda problem, *rest, **more: problem)
+
+    class Sampler:
+        problem = None
+
+        def of(self, problem: object) -> "Sampler":
+            return self
+
+        def value_from(self, theta: tuple[float, ...], kappa: list[float]) -> Any:
+            return SimpleNamespace(theta=theta, kappa=kappa, feasible=kappa == [1.0], shortfall="")
+
+    fast = Sampler().value_from((0.0,), [2.0])
+    search = ShareSearch(Sampler(), fast, Plan(0.9, 0.9), {}, 0)  # type: ignore[arg-type]
+    with pytest.raises(NoDesign):
+        search.on(())
+    assert replace(search, whole_box=(1.0,)).on(()).best.kappa == [1.0]

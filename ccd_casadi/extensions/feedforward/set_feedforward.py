@@ -170,7 +170,9 @@ def set_feedforward(
     limits = ForceLimits(max(item.peak(x) for item in responses),
                          max(item.heat(x) for item in responses))  # fmt: skip
     latest = float(np.minimum(late, length).max())
-    found = _best(responses, _shapes(run, one, taps, options), x, window, limits, latest, options)
+    found = _best(
+        responses, _shapes(run, one, taps, samples, options), x, window, limits, latest, options
+    )
     for i in range(options.rounds):
         more = respond(_drawn(run, options.drawn, [seed, 1 + i]), samples=samples)
         times = np.array([one.shaped(found.shape).settled(found.x, window) for one in more])
@@ -246,16 +248,20 @@ def _drawn_shifts(run: FinishedRun, count: int, seed: list[int]) -> list[StateSp
             for at in zip(shifts, factors, strict=True)]  # fmt: skip
 
 
-def _shapes(run: FinishedRun, one: Shape, taps: int, options: FeedforwardSetOptions) -> list[Shape]:
-    """Without a shaper, and with the taps spread over parts of a period of the lowest mode."""
+def _shapes(
+    run: FinishedRun, one: Shape, taps: int, samples: int, options: FeedforwardSetOptions
+) -> list[Shape]:
+    """Without a shaper, and with the taps spread over parts of a period of the lowest resonance,
+    all of them within the samples."""
     modal = run.modal()
-    flexible = np.diag(modal.K)[~modal.rigid]
+    flexible = np.diag(modal.K)[modal.numbered]
     flexible = flexible[flexible > 0.0]
     if taps == 1 or not flexible.size:
         return [one]
     period = 2.0 * np.pi / float(np.sqrt(flexible.min()))
     spacings = [round(share * period * _rate(run) / (taps - 1)) for share in options.spreads]
-    return [one, *(replace(one, taps=taps, spacing=max(d, 1)) for d in dict.fromkeys(spacings))]
+    within = dict.fromkeys(d for d in spacings if (taps - 1) * d < samples)
+    return [one, *(replace(one, taps=taps, spacing=max(d, 1)) for d in within)]
 
 
 def _best(

@@ -97,6 +97,8 @@ class ShareSearch:
         Of new draws, each of the certificate's number.
     settled : bool
         Whether new draws have accepted it.
+    whole_box : tuple of float
+        κ in SI of the design for the whole box, from which a search may start again.
     """
 
     sampler: Sampler
@@ -107,6 +109,7 @@ class ShareSearch:
     tail: tuple[Machine, ...] = ()
     rounds: int = 0
     settled: bool = False
+    whole_box: tuple[float, ...] = ()
 
     @property
     def problem(self) -> CoDesignProblem:
@@ -204,6 +207,8 @@ class ShareSearch:
         problem = with_warm_start(self.problem, self.best.kappa)
         sampler = self.sampler.of(with_structured(problem, scenarios=scenarios))
         best = sampler.value_from(self.best.theta, self.best.kappa)
+        if not best.feasible and self.whole_box:  # that from the model alone may be unstable there
+            best = sampler.value_from(self.best.theta, list(self.whole_box))
         if not best.feasible:
             raise NoDesign(f"no controller was found for this share: {best.shortfall}")
         return replace(self, sampler=sampler, best=best)
@@ -267,7 +272,7 @@ def started(
     start = own_sampler.value_from(theta, kappa.tolist())
     if not start.feasible:
         raise NoDesign(f"no controller was found for the model alone: {start.shortfall}")
-    return ShareSearch(own_sampler, start, plan, distribution, seed)
+    return ShareSearch(own_sampler, start, plan, distribution, seed, whole_box=(*kappa.tolist(),))
 
 
 def search_share(
