@@ -10,10 +10,8 @@
 Measured, five tolerances at 3 sigma: the model alone about 80 Hz, the whole box 64.84 Hz, the share
 68.16 Hz (+5.1 %). 2 failures in six rounds of 13,809 draws accepted it (3 may), after 30 rounds in
 all; of its own certificate none failed (5 may). 20 of 20 certificates of other draws agree, with 0
-to 2 failures each and 12 in all, 4.3e-5 of all machines: 5 by the judge, 15 by the engine of the
-search and the judge on what that had above a bound by 5e-5. Where one round accepted it, four
-of five agreed (68.45 Hz). Of 777 toys below 99.9 % 2 were claimed (at 99 % confidence 8 may be).
-Prices
+to 2 failures each and 12 in all, 4.3e-5 of all machines. Where one round accepted it, four of five
+agreed (68.45 Hz). Of 777 toys below 99.9 % 2 were claimed (at 99 % confidence 8 may be). Prices
 agree with many starts to 1.2 %, but for half of the rib stage's shift (3.26 Hz, many starts 2.86)
 and of that of two encoders (2.27 and 1.70), where the list has found better designs. By multipliers
 they are off by 1 to 10 %, of damping by 20 to 30 %. With the shipped ±2 % of each mode and damping
