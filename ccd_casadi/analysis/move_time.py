@@ -31,6 +31,7 @@ from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array, states
+from ccd_casadi.support.process_pool import Pool
 
 
 @dataclass(frozen=True)
@@ -140,8 +141,11 @@ class MoveTime:
     motion: MotionAt
     options: MoveTimeOptions = MoveTimeOptions()
 
-    def at(self, kappa: Array) -> tuple[float, Array]:
-        """ln v (s) at κ in SI, and its gradient; infinite where a loop is unstable."""
+    def at(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
+        """ln v (s) at κ in SI, and its gradient; infinite where a loop is unstable.
+
+        Workers are not used: a plant takes a millisecond.
+        """
         kappa = np.asarray(kappa, float)
         found = self._crossings(kappa)
         if not all(each.stable for each in found):

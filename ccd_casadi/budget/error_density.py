@@ -65,15 +65,12 @@ class QuadratureOptions:
 class Integral:
     """Values (rows,) with error estimates; `ends` (k + 1,) of the panels, their shares (rows, k).
 
-    `nodes` and `weights` (N,) make the same sums of any other integrand as smooth.
     """
 
     value: Array
     error: Array
     ends: Array
     parts: Array
-    nodes: Array
-    weights: Array
 
     def cumulative(self) -> Array:
         """The integral from the lowest frequency to each of `ends`, (rows, k + 1)."""
@@ -81,9 +78,17 @@ class Integral:
 
 
 def integrate(
-    f: Callable[[Array], Array], ends: Array, *, options: QuadratureOptions = QuadratureOptions()
+    f: Callable[[Array], Array],
+    ends: Array,
+    counted: int | None = None,
+    *,
+    options: QuadratureOptions = QuadratureOptions(),
 ) -> Integral:
-    """Rows f(x) (rows, len(x)) over the panels between `ends`, rising and above 0."""
+    """Rows f(x) (rows, len(x)) over the panels between `ends`, rising and above 0.
+
+    Panels are halved until the first `counted` rows, or all, are as exact as required: further
+    rows, such as derivatives of the first, are summed on the same nodes.
+    """
     low, high = np.log(ends[:-1]), np.log(ends[1:])
     done: list[Array] = []  # low, high, shares and errors of panels, by column
     spent = 0
@@ -96,7 +101,7 @@ def integrate(
         error = np.abs(value @ (KRONROD - GAUSS))
         total = part.sum(1) + sum(item[2 : 2 + rows].sum(1) for item in done)
         allowed = options.tolerance * np.abs(total)[:, None] / (4 * len(ends))
-        wide = (error > np.maximum(allowed, 1e-15 * np.abs(part))).any(0)
+        wide = (error > np.maximum(allowed, 1e-15 * np.abs(part)))[:counted].any(0)
         if turn == options.rounds - 1 or spent > options.most_evaluations:
             wide[:] = False
         done.append(np.vstack([low, high, part, error])[:, ~wide])
@@ -107,11 +112,7 @@ def integrate(
     found = np.hstack(done)
     low, high, *both = found[:, np.argsort(found[0])]
     part, error = np.split(np.array(both), 2)
-    x, weights = _points(low, high)
-    return Integral(
-        part.sum(1), error.sum(1), np.exp(np.append(low, high[-1])), part, x.ravel(),
-        (weights * KRONROD).ravel(),
-    )  # fmt: skip
+    return Integral(part.sum(1), error.sum(1), np.exp(np.append(low, high[-1])), part)
 
 
 def _points(low: Array, high: Array) -> tuple[Array, Array]:
@@ -186,10 +187,10 @@ def responses(loop: Loop, hz: Array) -> Responses:
     Responses
     """
     omega = HZ * np.asarray(hz, float)
-    G, K = (part.response(omega) for part in loop.as_run)
+    G, K = loop.run_responses(omega)
     plant, ports = loop.plant, loop.ports
     disturbed = strictly_proper(plant.A, ports.drive, plant.C)
-    free = disturbed.response(omega) if loop.sampling or loop.drive is not None else G
+    free = disturbed.swept(omega) if loop.sampling or loop.drive is not None else G
     if G.shape[1] == G.shape[2]:
         S = sensitivity(G @ K)
         moved = S @ free
@@ -201,8 +202,8 @@ def responses(loop: Loop, hz: Array) -> Responses:
     if ports.beyond is None:
         return found
     of_u, of_d = (strictly_proper(plant.A, B, ports.beyond) for B in (loop.plant.B, ports.drive))
-    run = replace(loop, plant=of_u).as_run[0]
-    return replace(found, beyond=(run.response(omega), of_d.response(omega)))
+    run = replace(loop, plant=of_u).run_responses(omega)[0]
+    return replace(found, beyond=(run, of_d.swept(omega)))
 
 
 def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg.lapack import dgees, dtrsyl
 
-from ccd_casadi.budget.error_density import integrated, responses
+from ccd_casadi.budget.error_density import integrate, integrated, panels, responses
 from ccd_casadi.budget.noise_process import (
     FORCES,
     Matrix,
@@ -134,20 +134,24 @@ class ErrorVariance:
         K, *stepped = (StateSpace(*own) for own in zip(*parts, strict=True))
         K = StateSpace(*(np.real(part) for part in (K.A, K.B, K.C, K.D)))
         loop = Loop(self.plant, K, self.hold)
-        whole = integrated(loop, source, np.zeros_like)
-        hz = whole.nodes
-        density, moving = source.density(hz) * whole.weights, _ResponseChanges(loop, hz)
-        at = responses(loop, hz)
-        H = at.of(source.kind)[0]
-        value = density @ (np.abs(H) ** 2).sum((1, 2))
-        gradient = []
-        for dG, dK, dfree in [*map(moving.of_controller, stepped), *map(moving.of_plant, plants)]:
-            d = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
-            if source.kind in FORCES:
-                d = -d @ at.free - at.S @ dfree
-            elif source.kind is not SourceKind.SETPOINT:
-                d = -d
-            gradient.append(density @ (2.0 * (H.conj() * d).real.sum((1, 2))))
+
+        def rows(hz: Array) -> Array:
+            """S_e, and its derivatives along every step."""
+            moving, at = _ResponseChanges(loop, hz), responses(loop, hz)
+            H = at.of(source.kind)[0]
+            found = [(np.abs(H) ** 2).sum((1, 2))]
+            for dG, dK, dfree in (
+                *map(moving.of_controller, stepped), *map(moving.of_plant, plants)
+            ):  # fmt: skip
+                d = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
+                if source.kind in FORCES:
+                    d = -d @ at.free - at.S @ dfree
+                elif source.kind is not SourceKind.SETPOINT:
+                    d = -d
+                found.append(2.0 * (H.conj() * d).real.sum((1, 2)))
+            return np.array(found) * source.density(hz)
+
+        value, *gradient = integrate(rows, panels(loop, source), 1).value
         return float(value), np.array(gradient)
 
 
@@ -155,13 +159,15 @@ class _ResponseChanges:
     """dG and dK as in the loop, and d of the disturbed G, at frequencies in Hz.
 
     d(C X) = C R dA X + dC X + C R dB + dD,   R = (s - A)⁻¹,  X = R B
+
+    with eigenvectors V of A, where these are sound, as the states: R is diagonal there.
     """
 
     def __init__(self, loop: Loop, hz: Array) -> None:
         self.hold, self.free = loop.sampling, 1j * HZ * np.asarray(hz, float)
         self.s = loop.as_run[0].variable(HZ * np.asarray(hz, float))
         self.none = np.zeros((len(hz), 1, 1))
-        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.known: dict[str, tuple[np.ndarray, ...]] = {}
 
     def of_controller(self, K: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(dG, dK, d of the disturbed G) of a stepped controller."""
@@ -177,14 +183,25 @@ class _ResponseChanges:
 
     def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
         """By the imaginary parts of a system's matrices over the step."""
-        A, B, C = (np.real(part) for part in (system.A, system.B, system.C))
         parts = (system.A, system.B, system.C, system.D)
         dA, dB, dC, dD = (np.imag(part) / COMPLEX_STEP for part in parts)
         if name not in self.known:
-            R = np.linalg.inv(s[:, None, None] * np.eye(len(A)) - A)
-            self.known[name] = (R @ B, C @ R)
-        X, Y = self.known[name]
+            self.known[name] = _halves(StateSpace(*(np.real(part) for part in parts)), s)
+        X, Y, V, inverse = self.known[name]
+        dA, dB, dC = inverse @ dA @ V, inverse @ dB, dC @ V
         return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)
+
+
+def _halves(system: StateSpace, s: np.ndarray) -> tuple[np.ndarray, ...]:
+    """R B and C R (k, ·, ·) in the states V⁻¹x, V and V⁻¹: eigenvectors, or 1."""
+    if system.modes is None:
+        one = np.eye(len(system.A))
+        R = np.linalg.inv(s[:, None, None] * one - system.A)
+        return R @ system.B, system.C @ R, one, one
+    poles, drive, reading = system.modes
+    R = 1.0 / (s[:, None] - poles)
+    V = np.linalg.eig(system.A)[1]
+    return R[:, :, None] * drive, reading * R[:, None, :], V, np.linalg.inv(V)
 
 
 class Lyapunov:

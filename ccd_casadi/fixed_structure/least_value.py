@@ -16,7 +16,7 @@ but for that payment, `reward` dτ/dθ.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -50,7 +50,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
 from ccd_casadi.support.time_budget import ends_early
@@ -75,8 +75,11 @@ class Goal(Protocol):
         ln v and its gradient to κ (n,) in SI; ∂ ln v/∂θ (n_θ,) at fixed κ; v with its unit.
     """
 
-    def at(self, kappa: Array) -> tuple[float, Array]:
-        """ln v at κ in SI, and its gradient; infinite where a loop is unstable."""
+    def at(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
+        """ln v at κ in SI, and its gradient; infinite where a loop is unstable.
+
+        The plants may be spread over workers.
+        """
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln v/∂θ at a fixed κ."""
@@ -111,10 +114,10 @@ class RmsError:
         rest = self.budget, self.hold, self.structure.order
         return tuple(ErrorVariance(plant.plant_si(), *rest) for plant in self.plants)
 
-    def at(self, kappa: Array) -> tuple[float, Array]:
+    def at(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
         steps = 1j * COMPLEX_STEP * np.eye(len(kappa) + 1, len(kappa), -1)
-        return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants))
+        return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants), workers)
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
@@ -130,14 +133,20 @@ class RmsError:
         return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(
-        self, kappa: np.ndarray, moved: Sequence[Sequence[StateSpace]]
+        self,
+        kappa: np.ndarray,
+        moved: Sequence[Sequence[StateSpace]],
+        workers: Pool | None = None,
     ) -> tuple[float, Array]:
         """ln e and its gradient to the steps of κ after the first and to those of each plant."""
         parts = self.structure.state_spaces(kappa)
         M = run_matrix(parts, None if self.hold is None else self.hold.period)
         value, slopes = 0.0, np.zeros(len(kappa) - 1 + len(moved[0]))
-        for variance, own in zip(self.variances, moved, strict=True):
-            found = variance.at(parts, M, own)
+        each = enumerate(zip(self.variances, moved, strict=True))
+        tasks = {i: (variance, parts, M, own) for i, (variance, own) in each}
+        of_plant = dict(results(workers, ErrorVariance.at, tasks))
+        for i in tasks:  # in their order, whichever came first: sums of floats depend on it
+            found = of_plant[i]
             if found is None:
                 return np.inf, np.full(len(slopes), np.nan)
             value, slopes = value + found[0], slopes + found[1]
@@ -246,8 +255,11 @@ def least_value(
             begins.append(np.append(begin, tau))
         if best.design is not design and ends_early("least-value start", len(begins)):
             break
-        tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
-        ends = dict(results(workers, _descended, tasks))
+        if len(begins) == 1 and isinstance(workers, Workers):  # a cluster is too far for a plant
+            ends = {0: _descended(descent, begins[0], known, workers)}
+        else:
+            tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
+            ends = dict(results(workers, _descended, tasks))
         for i in range(len(begins)):
             start, end, count = ends[i]
             if start is None or end is None or _is_known(known, start):
@@ -279,18 +291,20 @@ class _Descent:
     reward: float
     floor: float
 
-    def scaled(self, kappa: Array) -> tuple[float, Array]:
+    def scaled(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
         """ln v and its gradient at κ in the problem's units."""
         units = self.problem.plants
-        return self.goal.at(self.problem.structure.in_units(kappa, units.omega_0, units.force))
+        own = self.problem.structure.in_units(kappa, units.omega_0, units.force)
+        return self.goal.at(own, workers)
 
 
 def _descended(
-    descent: _Descent, x: Array, known: Sequence[Array]
+    descent: _Descent, x: Array, known: Sequence[Array], workers: Pool | None = None
 ) -> tuple[Array | None, Iterate[Assessment] | None, int]:
     """From x to where steps no longer help, or come to what is known: the start as it is, the end,
     and how many loops were assessed; none of a start that is known or not stable."""
-    model = LoopModel(descent.problem, descent.scaled, descent.reward, descent.floor)
+    scaled = partial(descent.scaled, workers=workers)
+    model = LoopModel(descent.problem, scaled, descent.reward, descent.floor)
     model.known = list(known)
     start = model.at(x)
     if start is None or model.is_known(start.x):

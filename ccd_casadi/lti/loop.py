@@ -294,7 +294,7 @@ class Loop:
         plant, ports, p = self.plant, self.ports, len(self.plant.C)
         C = np.vstack([plant.C, ports.counted])
         whole = replace(self, plant=strictly_proper(plant.A, plant.B, C), drive=None, counted=None)
-        (G, K), free = whole._responses(omega), strictly_proper(plant.A, ports.drive, C)
+        (G, K), free = whole.run_responses(omega), strictly_proper(plant.A, ports.drive, C)
         d = free.swept(omega)
         u = np.linalg.solve(np.eye(G.shape[2]) + K @ G[:, :p], K @ d[:, :p])
         return np.asarray(d[:, p:] - G[:, p:] @ u)
@@ -311,20 +311,21 @@ class Loop:
 
     def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         """G (k, p, m), hold and delay in it, and K (k, m, p) as they run, at ω (k,) in rad/s."""
-        G, K = self._responses(omega)
+        G, K = self.run_responses(omega)
         return self.at[0].opened(G, K) if self.at else (G, K)
 
     def curves(self, omega: Array) -> dict[str, np.ndarray]:
         """S, T, KS and GS as matrices (k, ·, ·); KS the whole force."""
         found = responses_of(*self.responses(omega))
         if self.at and self.at[0].output:
-            G, K = self._responses(omega)
+            G, K = self.run_responses(omega)
             found["KS"] = K @ np.array([self.at[0].reference]).T / (1.0 + K @ G)
         if self.ported:
             found["GS"] = self.moved(omega)
         return found
 
-    def _responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+    def run_responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """As `responses`, at no place where the loop is broken."""
         G, K = self.as_run
         if self.sampling is None or self.plant.modes is None:
             return G.swept(omega), K.swept(omega)
