@@ -63,9 +63,7 @@ class QuadratureOptions:
 
 @dataclass(frozen=True)
 class Integral:
-    """Values (rows,) with error estimates; `ends` (k + 1,) of the panels, their shares (rows, k).
-
-    """
+    """Values (rows,) with error estimates; `ends` (k + 1,) of the panels, their shares (rows, k)."""
 
     value: Array
     error: Array
@@ -189,7 +187,8 @@ def responses(loop: Loop, hz: Array) -> Responses:
     omega = HZ * np.asarray(hz, float)
     G, K = loop.run_responses(omega)
     plant, ports = loop.plant, loop.ports
-    disturbed = strictly_proper(plant.A, ports.drive, plant.C)
+    own = ports.drive is plant.B  # then what is known of the plant serves
+    disturbed = plant if own else strictly_proper(plant.A, ports.drive, plant.C)
     free = disturbed.swept(omega) if loop.sampling or loop.drive is not None else G
     if G.shape[1] == G.shape[2]:
         S = sensitivity(G @ K)

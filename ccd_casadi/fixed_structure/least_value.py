@@ -133,10 +133,7 @@ class RmsError:
         return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(
-        self,
-        kappa: np.ndarray,
-        moved: Sequence[Sequence[StateSpace]],
-        workers: Pool | None = None,
+        self, kappa: np.ndarray, moved: Sequence[Sequence[StateSpace]], workers: Pool | None = None
     ) -> tuple[float, Array]:
         """ln e and its gradient to the steps of κ after the first and to those of each plant."""
         parts = self.structure.state_spaces(kappa)

@@ -326,13 +326,11 @@ class Loop:
 
     def run_responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         """As `responses`, at no place where the loop is broken."""
-        G, K = self.as_run
-        if self.sampling is None or self.plant.modes is None:
-            return G.swept(omega), K.swept(omega)
-        poles, drive, reading = self.plant.modes
+        K = self.as_run[1].swept(omega)
+        if self.sampling is None:
+            return self.plant.swept(omega), K
         omega = self.plant.off_poles(omega, self.sampling.period)
-        f = transfer(poles, omega, self.sampling.period, self.sampling.delay)
-        return np.asarray((reading * f[:, None, :]) @ drive), K.swept(omega)
+        return held(self.plant, omega, self.sampling), K
 
     def sensitivity(self, omega: Array) -> np.ndarray:
         """S = (I + GK)⁻¹ (k, p, p)."""
@@ -418,6 +416,20 @@ class Loop:
         K = K if K.period else tustin(K, T)
         K = K if K.period == T else replace(K, period=T)
         return sampled(self.plant, T, self.sampling.delay), K
+
+
+def held(plant: StateSpace, omega: Array, sampling: Sampling) -> np.ndarray:
+    """The response (k, p, m) of a plant behind hold and delay, at ω (k,) in rad/s.
+
+    By its modes, those at 0 apart where their eigenvectors are no basis.
+    """
+    if plant.modes is not None:
+        poles, drive, reading = plant.modes
+        f = transfer(poles, omega, sampling.period, sampling.delay)
+        return np.asarray((reading * f[:, None, :]) @ drive)
+    if plant.at_rest is not None:
+        return np.asarray(sum(held(part, omega, sampling) for part in plant.at_rest))
+    return sampled(plant, sampling.period, sampling.delay).swept(omega)
 
 
 def at_instants(loop: ClosedLoop, period: float) -> ClosedLoop:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import eig, matrix_balance
+from scipy.linalg import eig, matrix_balance, schur, solve_sylvester
 
 from ccd_casadi.support.arrays import Array
 
@@ -54,6 +54,9 @@ class StateSpace:
         `off_poles`, so that loops of undamped plants have S, KS, T and GS there.
         """
         omega = self.off_poles(omega)
+        if self.modes is None and self.at_rest is not None:
+            rest, others = self.at_rest
+            return rest.swept(omega) + others.swept(omega)
         if self.modes is None:
             return self.response(omega)
         poles, drive, reading = self.modes
@@ -116,6 +119,28 @@ class StateSpace:
         if len(V) and not np.linalg.cond(V) < 1e8:  # a response of fewer than 8 digits
             return None
         return poles, np.linalg.solve(V, self.B + 0j), self.C @ V
+
+    @cached_property
+    def at_rest(self) -> "tuple[StateSpace, StateSpace] | None":
+        """The part of the poles at 0, free bodies whose eigenvectors are no basis, and the rest.
+
+        With the first k Schur vectors U of these, A = U T Uᵀ and T₁₁ Y - Y T₂₂ = -T₁₂,
+        C (s - A)⁻¹ B = C₁ (s - T₁₁)⁻¹ (B₁ - Y B₂) + (C₁ Y + C₂) (s - T₂₂)⁻¹ B₂. None without such
+        poles, without others, and in discrete time.
+        """
+        own = self.balanced()
+        sizes = np.abs(own.poles)  # in these units two poles at 0 do not split by rounding
+        if self.period or not 0 < (sizes == 0.0).sum() < len(sizes):
+            return None
+        T, U, k = schur(own.A, sort=lambda x, y: x == y == 0.0)
+        if not 0 < k < len(sizes):
+            return None
+        Y = solve_sylvester(T[:k, :k], -T[k:, k:], -T[:k, k:])
+        B, C = U.T @ own.B, own.C @ U
+        return (
+            StateSpace(T[:k, :k], B[:k] - Y @ B[k:], C[:, :k], self.D),
+            strictly_proper(T[k:, k:], B[k:], C[:, :k] @ Y + C[:, k:]),
+        )
 
     def zeros(self, unit: float = 1.0, *, infinite: float = 1e5) -> np.ndarray:
         """Finite invariant zeros of a square system, |z| < `infinite` `unit`; none of another.

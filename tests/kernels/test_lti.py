@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from ccd_casadi.fixed_structure.certificate_responses import sampled as judged
 from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, refine_peak, root_flanks
-from ccd_casadi.lti.loop import Loop, Sampling, at_instants, in_w, sampled, transfer, tustin
+from ccd_casadi.lti.loop import Loop, Sampling, at_instants, held, in_w, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, responses_of
 
 OMEGA = np.geomspace(0.1, 50.0, 40)
@@ -91,3 +92,25 @@ def test_a_grid_holds_its_resonances_and_a_climb_ends_on_top() -> None:
     at, height = refine_peak(gain, grid[top - 1], grid[top + 1])
     assert at == pytest.approx(np.sqrt(9.0 - 0.0002), rel=1e-7)
     assert height >= values.max()
+
+
+@pytest.mark.parametrize("delay_us", [0.0, 150.0])
+def test_a_free_body_beside_resonances_is_held_exactly(delay_us: float) -> None:
+    """1/(m s²) and a mode far below and far above it, in time: against sums of their own."""
+    rng, sampling = np.random.default_rng(3), Sampling(1e4, delay_us)
+    bodies, total = [], 0.0
+    omega = np.geomspace(1.0, 0.9 * np.pi * sampling.rate_hz, 40)
+    for w0 in (0.0, 30.0, 6e3):
+        A = np.array([[0.0, 1.0], [-(w0**2), -0.02 * w0]])
+        C = np.eye(1, 2) * rng.uniform(1.0, 2.0)
+        one = StateSpace(A, np.eye(2, 1, -1), C, np.zeros((1, 1)))
+        bodies.append(one)
+        total = total + sampled(one, sampling.period, sampling.delay).response(omega)
+    A = block_diag(*(one.A for one in bodies))
+    T = rng.normal(size=(6, 6))  # states of any kind
+    B, C = np.vstack([one.B for one in bodies]), np.hstack([one.C for one in bodies])
+    mixed = StateSpace(A, B, C, np.zeros((1, 1)))
+    np.testing.assert_allclose(held(mixed, omega, sampling), total, rtol=1e-9)
+    np.testing.assert_allclose(mixed.swept(omega), mixed.response(omega), rtol=1e-9)
+    other = StateSpace(np.linalg.solve(T, A @ T), np.linalg.solve(T, B), C @ T, np.zeros((1, 1)))
+    np.testing.assert_allclose(held(other, omega, sampling), total, rtol=1e-5)
