@@ -63,7 +63,7 @@ class QuadratureOptions:
 
 @dataclass(frozen=True)
 class Integral:
-    """Values (rows,) with error estimates; `ends` (k + 1,) of the panels, their shares (rows, k)."""
+    """Values (rows,) with error estimates; `ends` (k + 1,) of panels, their parts (rows, k)."""
 
     value: Array
     error: Array
