@@ -28,7 +28,9 @@ class MoveOptions:
     tail : float
         Periods of ω_b after the move, doubled until it has settled.
     doublings : int
-        At most.
+        At most, where the error at rest is outside the window.
+    patient_doublings : int
+        At most, where it is inside: the move settles, however slow the loop is.
     """
 
     least_steps: float = 50.0
@@ -36,6 +38,7 @@ class MoveOptions:
     steps_per_move: int = 400
     tail: float = 8.0
     doublings: int = 7
+    patient_doublings: int = 14
 
 
 @dataclass(frozen=True)
@@ -252,7 +255,9 @@ def simulate(
     ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz
     step = loop.period or float(np.clip(profile.duration / options.steps_per_move, *ends))
     A, drive = _over(loop, ahead, reference, step)
-    for _ in range(options.doublings):
+    left = wanted - rows @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])  # at rest, of position
+    stable = np.abs(np.linalg.eigvals(A)).max() < 1.0
+    for turn in range(options.patient_doublings):
         time = np.arange(np.ceil((profile.duration + tail) / step) + 1) * step
         r = profile.at(time) if loop.period is None else held_setpoint(profile, time, step)
         driven = r.T @ drive.T
@@ -262,13 +267,14 @@ def simulate(
         error = np.outer(r[0], wanted) - x @ rows.T
         if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
             break
+        rest = float(np.abs(r[0, -1] * left).max())  # where all its derivatives are zero
+        if turn + 1 >= options.doublings and not (stable and rest <= 0.5 * window):
+            break
         tail *= 2.0
     force = x @ closed.C_u.T + np.outer(r[0], closed.D_u @ reference) + r.T @ ahead
-    end = r[0, -1]  # whose derivatives are zero
-    rest = end * wanted - end * rows @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
     error = error[:, 0] if len(wanted) == 1 else error
     return Move(time, r[0], error, force, forces is not None,
-                profile.duration, window, rest=float(np.abs(rest).max()))  # fmt: skip
+                profile.duration, window, rest=float(np.abs(r[0, -1] * left).max()))  # fmt: skip
 
 
 def counted_rows(loop: Loop, axis: int, closed: ClosedLoop) -> tuple[Array, Array, Array]:

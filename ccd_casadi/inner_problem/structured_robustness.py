@@ -117,7 +117,8 @@ class DesignOnBox:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = structured_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed)
-            tell(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
+            late = f"{1e3 * time:.5g} ms" if np.isfinite(time) else "not settled"
+            tell(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
             if time > value:
                 found = (*found, (option, tuple(map(float, point))))
         return worst, found

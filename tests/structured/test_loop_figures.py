@@ -1,5 +1,7 @@
 """Margins, steps and warnings of a loop against what they mean."""
 
+from dataclasses import replace
+
 import control as ct
 import numpy as np
 import pytest
@@ -304,3 +306,17 @@ def test_a_light_pole_of_the_controller_is_not_excused_by_a_rising_plant() -> No
     found = second_crossover(omega, L * (1.0 - 2e3 * band), sizes, float(crossover), light)
     assert found is not None
     assert found.low < 100.0 < found.high
+
+
+@pytest.mark.parametrize("sampling", [None, Sampling(500.0)])
+def test_a_slow_loop_is_followed_until_it_settles(sampling: Sampling | None) -> None:
+    """By its slow pole: the error falls as e^{-rate t}; where an error stays, none waits."""
+    rate, window = 0.2, 1e-7
+    A, none = np.array([[0.0, 1.0], [0.0, -100.0]]), (np.zeros((0, 0)), np.zeros((0, 1)))
+    G = StateSpace(A, np.eye(2, 1, -1), np.eye(1, 2), np.zeros((1, 1)))
+    gain = StateSpace(*none, np.zeros((1, 0)), np.array([[rate * (100.0 - rate)]]))
+    how = {"axis": 0, "forces": None, "window": window, "bandwidth_hz": 20.0}
+    made = simulate(Loop(G, gain, sampling), setpoint(LIMITS), **how)
+    assert made.settled == pytest.approx(np.log(LIMITS.stroke / window) / rate, rel=0.05)
+    sprung = replace(G, A=A - np.array([[0.0, 0.0], [rate, 0.0]]))
+    assert np.isinf(simulate(Loop(sprung, gain, sampling), setpoint(LIMITS), **how).settled)

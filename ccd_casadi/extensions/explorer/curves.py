@@ -109,7 +109,8 @@ def _move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness."""
     ((made,),) = moves(
         [loop], [mass_feedforward(design.modal, 0, loop.at)], setpoint(LIMITS), axis=0,
-        window=LIMITS.window, bandwidth_hz=bandwidth_hz, options=MoveOptions(doublings=1),
+        window=LIMITS.window, bandwidth_hz=bandwidth_hz,
+        options=MoveOptions(doublings=1, patient_doublings=1),
     )  # fmt: skip
     return made.until(WATCHED * made.duration)
 
