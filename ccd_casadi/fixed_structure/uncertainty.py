@@ -11,12 +11,14 @@ For a proof it is a sum of modes, poles and residues as affine forms of what is 
 b_i c_i/s² of free bodies, and b_i c_i/(s² - w_i²) of what the stiffness drives away.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import hadamard
 
 from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
@@ -226,11 +228,23 @@ class UncertainPlant:
         option, (low, high) = rng.integers(len(self.options), size=count).tolist(), self.box
         return [*zip(option, rng.uniform(low, high, (count, len(low))), strict=True)]
 
-    def corners(self) -> list[tuple[int, Array]]:
+    def corners(self, full: int = 6) -> list[tuple[int, Array]]:
         """The model of every option, then the corners of its box.
 
-        With more than three parameters single modes' shifts go together, with the least damping:
-        there are too many other corners to assess, and a search finds those that matter.
+        With more than three parameters single modes' shifts go together, with the least damping,
+        and of more than `full` that are left each pair meets at all four of its ends (the rows of
+        a Hadamard matrix and their opposites): there are too many other corners to assess, and a
+        search finds those that matter.
+
+        Parameters
+        ----------
+        full : int
+            Parameters of which every corner is taken.
+
+        Returns
+        -------
+        list of (int, array (n,))
+            Number of an option, and a point of its box.
         """
         box, centre = self.box, self.nominal
         found = [(option, centre) for option in range(len(self.options))]
@@ -238,11 +252,16 @@ class UncertainPlant:
         if len(centre) > 3:
             goes_with = ["modes" if name.startswith("mode_shift") else name for name in goes_with]
         free = [name for name in dict.fromkeys(goes_with) if len(centre) <= 3 or name != "damping"]
+        if len(free) <= full:
+            ends = np.array(list(itertools.product((0, 1), repeat=len(free))))[:, ::-1]
+        else:
+            signs = hadamard(1 << len(free).bit_length())[:, 1 : 1 + len(free)]
+            ends = (np.vstack([signs, -signs]) + 1) // 2
         for option in range(len(self.options)):
-            for number in range(2 ** len(free) if free else 0):
-                end = {name: (number >> place) & 1 for place, name in enumerate(free)}
-                row = [end.get(name, 0) for name in goes_with]
-                found.append((option, box[row, np.arange(len(centre))]))
+            for row in ends if free else []:
+                at = dict(zip(free, row.tolist(), strict=True))
+                points = [at.get(name, 0) for name in goes_with]
+                found.append((option, box[points, np.arange(len(centre))]))
         return found
 
 

@@ -32,6 +32,9 @@ class WorstPlantOptions:
     along, along_first : int
         Points along each parameter of the model that varies, and of a first look: only where that
         finds no plant beyond its bounds all of them are assessed.
+    on_lines : int
+        Of these points in all, at most: with many such parameters lines run through the models and
+        evenly chosen corners of the rest.
     batch : int
         Plants that are assessed together.
     few : int
@@ -53,6 +56,7 @@ class WorstPlantOptions:
     within: float = 1e-4
     along: int = 61
     along_first: int = 16
+    on_lines: int = 4000
     batch: int = 48
     few: int = 4
     lattice: int = 200
@@ -319,7 +323,12 @@ def _moved(
 
 
 def lattice(
-    uncertain: UncertainPlant, count: int, seed: int, *, along: int = WorstPlantOptions.along
+    uncertain: UncertainPlant,
+    count: int,
+    seed: int,
+    *,
+    along: int = WorstPlantOptions.along,
+    on_lines: int = WorstPlantOptions.on_lines,
 ) -> list[tuple[int, Array]]:
     """Spread plants over the box: corners, lines along ranges, and a Latin hypercube.
 
@@ -330,6 +339,8 @@ def lattice(
         Points of the hypercube, the options in turn; evenly on one parameter.
     along : int
         Points along each parameter of the model that varies, at every corner of the others.
+    on_lines : int
+        Of these in all, at most: else at fewer corners.
 
     Returns
     -------
@@ -338,10 +349,13 @@ def lattice(
     """
     box, n = uncertain.box, len(uncertain.names)
     found = uncertain.corners()
+    models, others = found[: len(uncertain.options)], found[len(uncertain.options) :]
+    lines = on_lines // max(1, along * len(uncertain.ranges)) - len(models)
+    through = [*models, *others[:: -(-len(others) // max(1, lines)) or 1]]
     for row in range(n - len(uncertain.ranges), n):  # along a stroke what is worst comes and goes
         found += [
             (option, np.where(np.arange(n) == row, value, corner))
-            for option, corner in uncertain.corners()
+            for option, corner in through
             for value in np.linspace(box[0, row], box[1, row], along)
         ]
     if n == 0:
