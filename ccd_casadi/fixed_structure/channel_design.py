@@ -167,8 +167,8 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     field = _stable(problem, search.inside(search.initial))
     evaluations, known = len(search.initial), len(field)
     shared = min(len(M) for M in structure.directions) < len(structure.structures)
+    rng = np.random.default_rng(search.seed)
     if shared and not only_initial:
-        rng = np.random.default_rng(search.seed)
         if problem.bounds.error is not None:
             field += _stable(problem, search.inside(_of_sensors(search, problem, alike)))
         field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
@@ -183,6 +183,9 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
             field += fresh
             if fresh:
                 break
+        if not field:  # one channel alone would hold all unstable motions, the whole needs it not
+            field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
+            evaluations += len(field)
     if not field:
         return search.failed()
     tell = titled(search.tell, "whole loop")

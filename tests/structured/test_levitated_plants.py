@@ -18,12 +18,14 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, axis_of
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, given_decoupling
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.discs import discs_of
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
@@ -180,3 +182,29 @@ def test_a_levitated_plant_has_its_zone_of_iso_14839() -> None:
     assert found == {"zone": "B", "sensitivity_peak": 3.5}
     guided = problem_of(load_case("runs/two_mass.toml"))
     assert iso_entry(guided, guided.start, of_set) == {"iso_14839_3": None}
+
+
+def test_two_bearings_hold_a_rotor_that_each_of_them_feels_whole() -> None:
+    """4 kg, off centre between two magnets: two unstable motions, and both are in every channel, so
+    that no channel is designed alone."""
+    c, k_i, k_s = np.array([[1.0, -0.1], [1.0, 0.15]]), 40.0, np.array([1e5, 0.8e5])
+    M, drive = np.diag([4.0, 0.05]), k_i * c.T
+    K = -c.T @ np.diag(k_s) @ c
+    none = tuple(np.zeros((0, *part.shape)) for part in (M, M, K, drive, c))
+    rotor = UncertainPlant((Mechanics(M, 0.0 * M, K, drive, c, None, none),), 1e5, gain=0.1)
+    own = Structure(lead=1, biquads=0, roll_off=2)
+    structure = ChannelStructure(
+        given_decoupling(("a", "b"), [[1, 0], [0, 1]], [[1, 0], [0, 1]]), (own, own)
+    )
+    plants = rotor.plants(rotor.corners())
+    found = synthesise(plants, structure, BOUNDS, sampling=RUN, starts=3)
+    assert found.certified, found.outcome
+    for gain in (0.9, 1.0, 1.1):
+        A = np.block([[0.0 * M, np.eye(2)], [-solve(M, K), 0.0 * M]])
+        B, C = np.vstack([0.0 * M, gain * solve(M, drive)]), np.hstack([c, 0.0 * c])
+        loop = Loop(StateSpace(A, B, C, np.zeros((2, 2))), found.controller, RUN)
+        omega = np.geomspace(1.0, np.pi / RUN.period, 2000)
+        G, K_z = (part.response(omega) for part in loop.as_run)
+        S = np.linalg.norm(np.linalg.inv(np.eye(2) + G @ K_z), 2, axis=(1, 2))
+        assert loop.stable
+        assert S.max() <= BOUNDS.S_max * (1.0 + 2e-3)
