@@ -9,17 +9,20 @@ from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.support.text import HZ, number
 
 
-def sheet_rows(design: DriveDesign) -> list[dict[str, Any]]:
-    """One entry for each parameter, in the drive's unit."""
-    rows = []
+def sheet_rows(
+    design: DriveDesign, today: Mapping[str, float] | None = None
+) -> list[dict[str, Any]]:
+    """One entry for each parameter, in the drive's unit; `today`'s values by number or name."""
+    rows, given = [], today or {}
     for setting, value in zip(design.cascade.settings, design.values.tolist(), strict=True):
         shown = setting.shown(round(value * setting.per_si / setting.step))
+        old = given.get(setting.name, given.get(setting.number))
         rows.append({"number": setting.number, "name": setting.name, "value": shown,
-                     "unit": setting.unit})  # fmt: skip
+                     "unit": setting.unit, "today": old})  # fmt: skip
     return rows
 
 
-def entry(design: DriveDesign) -> dict[str, Any]:
+def entry(design: DriveDesign, today: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Everything that is known, as JSON holds it."""
     drive, judged, bounds = design.cascade.drive, design.certificate, design.certificate.worst
     return {
@@ -35,7 +38,7 @@ def entry(design: DriveDesign) -> dict[str, Any]:
         "proof": None if design.proof is None else {
             "proven": design.proof.proven, "words": design.proof.words,
             "levels": design.proof.levels, "slack": design.proof.slack},
-        "parameters": sheet_rows(design),
+        "parameters": sheet_rows(design, today),
         "sources": list(drive.sources),
         "chosen": list(drive.chosen),
         "unknown": list(drive.unknown),
@@ -73,13 +76,12 @@ def proof_words(design: DriveDesign) -> str:
 
 
 def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) -> str:
-    """The sheet as text, `today`'s values by number or name beside the new ones."""
-    rows, given = sheet_rows(design), today or {}
+    """The sheet as text, `today`'s values beside the new ones."""
     head = ["number", "parameter", "new", "unit"] if today is None else [
         "number", "parameter", "today", "new", "unit"]  # fmt: skip
     lines = [head]
-    for row in rows:
-        old = given.get(row["name"], given.get(row["number"]) if row["number"] else None)
+    for row in sheet_rows(design, today):
+        old = row["today"]
         before = [] if today is None else ["" if old is None else f"{old:.10g}"]
         lines.append([row["number"], row["name"], *before, f"{row['value']:.10g}", row["unit"]])
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
