@@ -12,12 +12,12 @@ from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.sheet import proof_words, sheet_rows
 from ccd_casadi.extensions.drives.two_rates import lift
+from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.reporting.gain_figures import bandwidth_level, sensitivity_panel
 from ccd_casadi.support.text import HZ, number, template
 
 Today = Mapping[str, float]
-POINTS = 1500
 
 
 def drive_page(
@@ -46,7 +46,8 @@ def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture
     period, late = 1e6 * own.period, 1e6 * drive.sampling.delay
     often = f"every {number(own.slower * period)} µs"
     blocks = [_block("position", often, rows[:1], "", "left")]
-    current, at = [], 3
+    current: list[dict[str, Any]] = []
+    at = 3
     for slot in own.slots:
         part = rows[at : at + len(slot.settings)]
         at += len(part)
@@ -88,8 +89,7 @@ def _sensitivity(drive: DriveProblem, design: DriveDesign) -> c.Figure:
     loop = lift(design.cascade, design.values, sampled(plant, sampling.period, sampling.delay))
     low = bounds.omega_low / HZ
     high = 0.499 / (sampling.period * design.cascade.slower)  # above it the position is aliased
-    hz = np.unique([*np.geomspace(low, high, POINTS), *np.abs(plant.rates) / HZ])
-    hz = hz[(hz >= low) & (hz <= high)]
+    hz = frequency_grid(low, high, 900, np.abs(plant.rates) / HZ)
     curves = []
     for place, colour in zip(loop.places, (BLUE, ORANGE, GREEN), strict=False):
         name = "actuator" if place is None else (
