@@ -31,9 +31,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.drives.drive_case import drive_problem
     from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
-    from ccd_casadi.extensions.drives.drive_page import drive_page
     from ccd_casadi.extensions.drives.sheet import (
         codesign_words,
+        drive_page,
         entry,
         figures_of,
         named_theta,
