@@ -253,12 +253,22 @@ class DriveTable:
         unit="Hz",
         check=checks.number(0.0, 1e9, "give more than 0"),
     )
-    filters: int = key("filters of the current command in use", 3, check=checks.count(0))
-    setpoint_filters: int = key("filters of the velocity setpoint in use", 0, check=checks.count(0))
+    filters: int = key("filters of the current command", 3, check=checks.count(0))
+    setpoint_filters: int = key("filters of the velocity setpoint", 0, check=checks.count(0))
     filter_gain: float = key(
-        "most that all filters may raise at any frequency",
+        "most that filters raise at any frequency",
         10.0,
         check=checks.number(1.0, 1e6, "give 1 to 1e6", closed=True),
+    )
+    filters_above: float = key(
+        "least frequency of a filter over ω_b",
+        2.0,
+        check=checks.number(1.0, 1e3, "give 1 to 1000", closed=True),
+    )
+    decay: float = key(
+        "largest ω_b Tn and ω_b/Kv",
+        4.0,
+        check=checks.number(0.1, 1e9, "give 0.1 to 1e9", closed=True),
     )
 
 

@@ -16,18 +16,18 @@ SENSORS = {
 }
 
 
-def axis(theta, damping_ratio=0.02, sensor="both"):
+def axis(theta, damping_ratio=0.02, sensor="both", table=TABLE, length=LENGTH):
     d, lead = 1e-3 * theta["diameter"], 1e-3 * theta["lead"]
     core, gear = 0.85 * d, 2.0 * ca.pi / lead
     turned = (MOTOR + DENSITY * ca.pi * d**4 / 32.0 * LENGTH) * gear**2  # kg
-    screw, nut, bearing = STEEL * ca.pi * core**2 / 4.0 / LENGTH, 1.2e10 * d, 3.0e8
+    screw, nut, bearing = STEEL * ca.pi * core**2 / 4.0 / length, 1.2e10 * d, 3.0e8
     k = 1.0 / (1.0 / screw + 1.0 / nut + 1.0 / bearing)  # N/m
     return {
-        "mass": ca.diag(ca.vertcat(turned, TABLE)),
+        "mass": ca.diag(ca.vertcat(turned, table)),
         "damping_ratio": damping_ratio,
         "stiffness": k * ca.DM([[1.0, -1.0], [-1.0, 1.0]]),
         "input": ca.DM([1.0, 0.0]),
         "output": SENSORS[sensor],
-        "hardware_cost": (turned + TABLE) / 1000.0,  # t, what the motor accelerates
+        "hardware_cost": (turned + table) / 1000.0,  # t, what the motor accelerates
         "constraints": {},
     }

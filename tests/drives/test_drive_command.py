@@ -67,4 +67,9 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     sheet = (out / "sheet.txt").read_text("utf-8")
     assert "p1417" in sheet
     assert "500" in sheet
+    page = (out / "report.html").read_text("utf-8")
+    for row in answer["parameters"]:  # each block of the diagram, as the drive names and writes it
+        assert f"{row['number']} {row['name'].split(', ')[-1]}".strip() in page
+        assert f">{row['value']:.10g}<" in page
+    assert [row["today"] for row in answer["parameters"]].count(None) == 9
     assert "cascade_step" in (out / "cascade.c").read_text("utf-8")

@@ -13,12 +13,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot
 from ccd_casadi.extensions.drives.forms import FORMS, Filter
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.text import HZ
 
 Values = Sequence[float] | Array  # SI, in the order of the settings
 
@@ -48,6 +50,8 @@ class Cascade:
     filter_gain : float
         What all filters on a sensor's way may raise at any frequency, relative to their gain at
         rest: without a limit they become leads that amplify noise.
+    filters_above, decay : float
+        Least frequency of a filter over ω_b; largest ω_b Tn and ω_b/Kv (`allowed`).
     slower : int
         N: the position's error is read at every N-th instant, and held between (`two_rates`).
     """
@@ -59,6 +63,8 @@ class Cascade:
     velocity: int
     sensors: int
     filter_gain: float = np.inf
+    filters_above: float = 2.0
+    decay: float = 4.0
     slower: int = 1
 
     @cached_property
@@ -78,9 +84,25 @@ class Cascade:
     def ranges(self) -> Array:
         """Least and largest values (2, n), SI; frequencies below half the rate."""
         found = np.array([setting.range for setting in self.settings]).T
-        hertz = [setting.unit == "Hz" for setting in self.settings]
-        found[1, hertz] = np.minimum(found[1, hertz], 0.49 / self.period)
+        found[1, self.hertz] = np.minimum(found[1, self.hertz], 0.49 / self.period)
         return found
+
+    @cached_property
+    def hertz(self) -> np.ndarray:
+        """Which settings are frequencies of filters."""
+        return np.array([setting.unit == "Hz" for setting in self.settings])
+
+    def allowed(self, values: Values) -> Array:
+        """The ω_b that Kv, Tn and each filter's frequency allow.
+
+        Filters an octave or more above ω_b shape resonances; beside it they take the place of the
+        gains. A force that steps to F moves the load by F/(Kp Kv), and that decays with poles of
+        the loop next to the zeros -1/Tn and -Kv of K: where these are slow the axis creeps back.
+        So ω_b Tn <= a and ω_b/Kv <= a. The symmetric optimum has Tn = a/ω_c, a of 2 to 4, ω_c the
+        crossover of the velocity loop.
+        """
+        by_filters = HZ * np.asarray(values)[self.hertz] / self.filters_above
+        return np.concatenate([[self.decay * values[0], self.decay / values[2]], by_filters])
 
     def parts(self, values: Values) -> list[dict[str, float]]:
         """The parameters of each filter by name."""
@@ -156,24 +178,26 @@ class Cascade:
     def state_space(self, values: Values) -> StateSpace:
         """K(z), errors of all sensors in, force out, coefficients as the drive rounds
         them; of a slower position loop e as it is held."""
-        Kv, Kp, Tn = (float(value) for value in values[:3])
-        T = self.period
+        (Kv, Kp, Tn), T = map(float, values[:3]), self.period
         blocks = {"current": [], "setpoint": []}  # type: dict[str, list[StateSpace]]
         for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
             blocks[slot.place].append(_second_order(*block.coefficients(own), T))
-        ahead = _of(Kv, T)
+        sensor = np.eye(self.sensors)
+        reads, none = sensor[[self.velocity]], np.zeros((1, 0))
+        position = StateSpace(none[:0], sensor[:0], none, Kv * sensor[[self.position]], period=T)
         for one in blocks["setpoint"]:
-            ahead = _series(ahead, one)
-        # motor: w = (y_k - y_{k-1})/T
-        motor = StateSpace(np.zeros((1, 1)), np.ones((1, 1)), np.array([[-1.0 / T]]),
-                           np.array([[1.0 / T]]), period=T)  # fmt: skip
-        both = _beside(ahead, self.position, motor, self.velocity, self.sensors)
+            position = position.series(one)
+        # the motor's: w = (y_k - y_{k-1})/T
+        motor = StateSpace(np.zeros((1, 1)), reads, np.array([[-1.0 / T]]), reads / T, period=T)
+        found = StateSpace(
+            block_diag(position.A, motor.A), np.vstack([position.B, motor.B]),
+            np.hstack([position.C, motor.C]), position.D + motor.D, period=T,
+        )  # fmt: skip
         share = Kp * T / Tn
         PI = StateSpace(np.eye(1), np.ones((1, 1)), np.array([[share]]), np.array([[Kp + share]]),
                         period=T)  # fmt: skip
-        found = _series(both, PI)
-        for one in blocks["current"]:
-            found = _series(found, one)
+        for one in (PI, *blocks["current"]):
+            found = found.series(one)
         return found
 
     def require_fit(self, values: Values) -> None:
@@ -184,35 +208,8 @@ class Cascade:
                 raise UserError(f"{words}; use fewer of these filters, or a lower S_max")
 
 
-def _of(gain: float, T: float) -> StateSpace:
-    return StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[gain]]),
-                      period=T)  # fmt: skip
-
-
 def _second_order(b: Array, a: Array, T: float) -> StateSpace:
     """The transposed direct form."""
     return StateSpace(np.array([[-a[1], 1.0], [-a[2], 0.0]]),
                       np.array([[b[1] - a[1] * b[0]], [b[2] - a[2] * b[0]]]),
                       np.array([[1.0, 0.0]]), np.array([[b[0]]]), period=T)  # fmt: skip
-
-
-def _series(first: StateSpace, second: StateSpace) -> StateSpace:
-    zero = np.zeros((len(first.A), len(second.A)))
-    return StateSpace(
-        np.block([[first.A, zero], [second.B @ first.C, second.A]]),
-        np.vstack([first.B, second.B @ first.D]),
-        np.hstack([second.D @ first.C, second.C]),
-        second.D @ first.D,
-        period=first.period,
-    )
-
-
-def _beside(one: StateSpace, i: int, other: StateSpace, j: int, inputs: int) -> StateSpace:
-    """The sum of two systems on inputs i and j of all."""
-    n, m = len(one.A), len(other.A)
-    A, B, D = np.zeros((n + m, n + m)), np.zeros((n + m, inputs)), np.zeros((1, inputs))
-    A[:n, :n], A[n:, n:] = one.A, other.A
-    B[:n, i], B[n:, j] = one.B[:, 0], other.B[:, 0]
-    D[0, i] += one.D[0, 0]
-    D[0, j] += other.D[0, 0]
-    return StateSpace(A, B, np.hstack([one.C, other.C]), D, period=one.period)

@@ -15,7 +15,6 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ
 
 
 @dataclass(frozen=True)
@@ -58,10 +57,12 @@ class SearchOptions:
     difference : float
         Of logarithms, for the slopes of fixed-point coefficients.
     least_damping, most_damping : float, float
-        Of a filter's denominator, below which a filter is a needle; of all, above which it is two
-        of first order far apart.
+        Of a filter's denominator, below which a filter is a needle; of all, above which one of its
+        roots lies below its frequency.
     stable : float
         By which a pole's modulus is below 1.
+    edge : float
+        Relative, by which rounding may put a value at the end of its range beside it.
     """
 
     starts: int = 24
@@ -92,8 +93,9 @@ class SearchOptions:
     highest: float = 0.4
     difference: float = 1e-5
     least_damping: float = 0.1
-    most_damping: float = 2.0
+    most_damping: float = 1.0
     stable: float = 1e-9
+    edge: float = 1e-9
 
 
 class CascadeRows:
@@ -128,7 +130,7 @@ class CascadeRows:
                 ranges[0, i] = max(ranges[0, i], options.least_damping)
             if "damping" in setting.name:
                 ranges[1, i] = min(ranges[1, i], options.most_damping)
-        self.hertz = hertz = np.array([setting.unit == "Hz" for setting in cascade.settings])
+        hertz = cascade.hertz
         ranges[1, hertz] = np.minimum(ranges[1, hertz], options.highest / T)
         self.low, self.high = np.log(ranges)
         self.mass = self._mass(plants[0])
@@ -143,6 +145,11 @@ class CascadeRows:
         w = self.bounds.omega_low
         G = plant.at(1j * np.array([w]))[0, self.cascade.position, 0]
         return float(1.0 / (abs(G) * w * w))
+
+    def inside(self, values: Array) -> bool:
+        """Whether every value is within its range, as the search takes it."""
+        edge, at = self.options.edge, np.log(np.fmax(values, 1e-300))
+        return bool((at >= self.low - edge).all() and (at <= self.high + edge).all())
 
     def stable(self, values: Array) -> bool:
         """Whether every plant's loop is."""
@@ -198,18 +205,19 @@ class CascadeRows:
         return c[good], np.concatenate(slopes)[good]
 
     def _filter_rows(self, kappa: Array, log_band: float) -> list[tuple[Array, Array]]:
-        """What filters may not do: raise their gain beyond `filter_gain`, or lie below ω_b, where
-        they would take the place of the PI."""
+        """What filters, Kv and Tn may not do: raise their gain beyond `filter_gain`, or allow less
+        than ω_b (`Cascade.allowed`)."""
         found, n = [], len(kappa)
         if np.isfinite(self.cascade.filter_gain):
             rise, steep = self.cascade.rises(np.exp(kappa), self.z)
             by_kappa = steep.reshape(n, -1).T
             value = (rise - np.log(self.cascade.filter_gain)).ravel()
             found.append((value, np.column_stack([by_kappa, np.zeros(len(by_kappa))])))
-        places = np.flatnonzero(self.hertz)
+        places = np.concatenate([[0, 2], np.flatnonzero(self.cascade.hertz)])
         slope = np.zeros((len(places), n + 1))
         slope[np.arange(len(places)), places], slope[:, -1] = -1.0, 1.0
-        return [*found, (log_band - np.log(HZ) - kappa[places], slope)]
+        slope[1, 2] = 1.0  # of Tn
+        return [*found, (log_band - np.log(self.cascade.allowed(np.exp(kappa))), slope)]
 
     def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
         """ln of the largest coefficient of each filter over what fixed point holds, by central
@@ -264,9 +272,10 @@ class CascadeRows:
         return True
 
     def judged(self, values: Array) -> tuple[float, float]:
-        """ω_b by the shape, and the largest ln of a peak over its bound, on the grid."""
+        """ω_b by the shape, Kv, Tn and the filters, and the largest ln of a peak over its
+        bound, on the grid."""
         K, b = self.cascade.responses(values, self.z)[0], self.bounds
-        bandwidth = np.inf
+        bandwidth = float(self.cascade.allowed(values).min())
         rise = self.cascade.rises(values, self.z)[0].max()
         worst = float(rise - np.log(self.cascade.filter_gain))
         for G in self.G:

@@ -76,7 +76,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             filters += there[:count]
         position, velocity, count = _sensors(bounds, table.velocity)
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
-                          table.filter_gain,
+                          table.filter_gain, table.filters_above, table.decay,
                           _slower(table, problem.sampling, bounds.omega_low))  # fmt: skip
         uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
     except CaseError:

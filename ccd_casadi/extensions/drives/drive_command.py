@@ -26,12 +26,14 @@ def main(options: argparse.Namespace) -> ExitCode:
     from dataclasses import replace
 
     from ccd_casadi.cases.case import load_case, parse_theta, read_toml
+    from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.drives.arithmetic import program_of
     from ccd_casadi.extensions.drives.drive_case import drive_problem
     from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
     from ccd_casadi.extensions.drives.sheet import (
         codesign_words,
+        drive_page,
         entry,
         figures_of,
         named_theta,
@@ -74,13 +76,14 @@ def main(options: argparse.Namespace) -> ExitCode:
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
     code = program_of(found.cascade, found.values).code(run_name(folder))
     (folder / "cascade.c").write_text(code, "utf-8")
-    answer = entry(found) | searched | {"seconds": options.seconds(), "seed": options.seed,
+    answer = entry(found, today) | searched | {"seconds": options.seconds(), "seed": options.seed,
                              "versions": versions()}  # fmt: skip
     write_json(folder / "drive.json", answer)
+    write_page(folder / "report.html", drive_page(run_name(folder), problem, found, today))
     if searched:
         text = f"{codesign_words(searched['codesign'])}\n{text}"
     inform(text)
-    inform(f"sheet         {folder / 'sheet.txt'}")
+    inform(f"page          {folder / 'report.html'}")
     if found.status == "verified":
         return ExitCode.DONE
     reason = proof_words(found) if found.certificate.passed else found.certificate.words

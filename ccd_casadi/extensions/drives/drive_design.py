@@ -6,9 +6,13 @@ import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
-from ccd_casadi.extensions.drives.cascade_search import Candidate, Search
+from ccd_casadi.extensions.drives.cascade_search import (
+    Candidate,
+    RoundingOptions,
+    Search,
+    on_the_grid,
+)
 from ccd_casadi.extensions.drives.proof import prove_cascade
-from ccd_casadi.extensions.drives.rounding import RoundingOptions, on_the_grid
 from ccd_casadi.extensions.drives.two_rates import judge_two_rates
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -192,7 +196,8 @@ def _design_two_rates(
         own = _tighter(own, max(1.0, peak) * (1.0 + options.lower), low * (1.0 + options.lower))
     assert free is not None
     cascade.require_fit(rounded.values)
-    return DriveDesign(cascade, rounded.values, judged.bandwidth, free, judged, None)
+    band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
+    return DriveDesign(cascade, rounded.values, band, free, judged, None)
 
 
 def _tighter(bounds: Bounds, peak: float, low: float) -> Bounds:

@@ -1,25 +1,37 @@
-"""The sheet that a person types into a drive: numbers, names, values, units; as text and JSON."""
+"""The sheet that a person types into a drive: numbers, names, values, units; as text, as JSON, and
+as a page that draws the cascade as wired, with |S| at every place where the loop may be broken."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
-from ccd_casadi.support.text import HZ, number
+from ccd_casadi.extensions.drives.two_rates import lift
+from ccd_casadi.lti.frequency_grid import frequency_grid
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.reporting.gain_figures import bandwidth_level, sensitivity_panel
+from ccd_casadi.support.text import HZ, number, template
+
+Today = Mapping[str, float]  # values by number or name
 
 
-def sheet_rows(design: DriveDesign) -> list[dict[str, Any]]:
-    """One entry for each parameter, in the drive's unit."""
-    rows = []
+def sheet_rows(design: DriveDesign, today: Today | None = None) -> list[dict[str, Any]]:
+    """One entry for each parameter, in the drive's unit; `today`'s values by number or name."""
+    rows, given = [], today or {}
     for setting, value in zip(design.cascade.settings, design.values.tolist(), strict=True):
         shown = setting.shown(round(value * setting.per_si / setting.step))
+        old = given.get(setting.name, given.get(setting.number))
         rows.append({"number": setting.number, "name": setting.name, "value": shown,
-                     "unit": setting.unit})  # fmt: skip
+                     "unit": setting.unit, "today": old})  # fmt: skip
     return rows
 
 
-def entry(design: DriveDesign) -> dict[str, Any]:
+def entry(design: DriveDesign, today: Today | None = None) -> dict[str, Any]:
     """Everything that is known, as JSON holds it."""
     drive, judged, bounds = design.cascade.drive, design.certificate, design.certificate.worst
     return {
@@ -35,7 +47,7 @@ def entry(design: DriveDesign) -> dict[str, Any]:
         "proof": None if design.proof is None else {
             "proven": design.proof.proven, "words": design.proof.words,
             "levels": design.proof.levels, "slack": design.proof.slack},
-        "parameters": sheet_rows(design),
+        "parameters": sheet_rows(design, today),
         "sources": list(drive.sources),
         "chosen": list(drive.chosen),
         "unknown": list(drive.unknown),
@@ -72,14 +84,13 @@ def proof_words(design: DriveDesign) -> str:
     return "there is none of two rates; between the judged plants nothing is proven"
 
 
-def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) -> str:
-    """The sheet as text, `today`'s values by number or name beside the new ones."""
-    rows, given = sheet_rows(design), today or {}
+def sheet_text(design: DriveDesign, today: Today | None = None) -> str:
+    """The sheet as text, `today`'s values beside the new ones."""
     head = ["number", "parameter", "new", "unit"] if today is None else [
         "number", "parameter", "today", "new", "unit"]  # fmt: skip
     lines = [head]
-    for row in rows:
-        old = given.get(row["name"], given.get(row["number"]) if row["number"] else None)
+    for row in sheet_rows(design, today):
+        old = row["today"]
         before = [] if today is None else ["" if old is None else f"{old:.10g}"]
         lines.append([row["number"], row["name"], *before, f"{row['value']:.10g}", row["unit"]])
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
@@ -91,8 +102,95 @@ def sheet_text(design: DriveDesign, today: Mapping[str, float] | None = None) ->
     found.append(f"bandwidth     {rounded:.4g} Hz; {free:.4g} Hz before rounding, on fewer plants")
     found.append(f"judged        {design.certificate.words}")
     found.append(f"proof         {proof_words(design)}")
-    limit = design.cascade.filter_gain
-    found.append(f"filters       raise their gain to {design.rise:.4g} of rest; limit {limit:.4g}")
+    own, (Kv, _, Tn) = design.cascade, design.values[:3]
+    lowest = design.values[own.hertz].min(initial=np.inf) / rounded
+    found.append(f"filters       raise their gain to {design.rise:.4g} of rest, limit "
+                 f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, limit "
+                 f"{own.filters_above:.4g}")  # fmt: skip
+    found.append(f"decay         ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
+                 f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}")  # fmt: skip
     found += [f"chosen        {words}" for words in drive.chosen]
     found += [f"not known     {words}" for words in drive.unknown]
     return "\n".join(found)
+
+
+def drive_page(
+    title: str, drive: DriveProblem, design: DriveDesign, today: Today | None = None
+) -> c.Page:  # fmt: skip
+    """Make report.html."""
+    own = design.cascade.drive
+    head = c.Head(
+        f"{own.title}: {title}", "good" if design.status == "verified" else "bad",
+        design.status.replace("_", " "), "", design.certificate.words,
+        f"{number(design.bandwidth / HZ, 4)} Hz at -3 dB of S. Proof: {proof_words(design)}",
+    )  # fmt: skip
+    notes = tuple(f"Chosen: {words}" for words in own.chosen)
+    notes += tuple(f"Not known: {words}" for words in own.unknown)
+    return c.Page(head, (
+        c.Chapter("As wired", (diagram(drive, design, today or {}),)),
+        c.Chapter("Sensitivity", (_sensitivity(drive, design),)),
+        c.Chapter("What the manuals do not say", (c.Bullets(notes),), folded=True),
+    ), index="")  # fmt: skip
+
+
+def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture:
+    """Draw the cascade with the drive's numbers, names, values and units, today's beside them."""
+    own, rows = design.cascade, sheet_rows(design, today)
+    names = [channel.name for channel in drive.bounds.channels] or ["the position", "the motor"]
+    period, late = 1e6 * own.period, 1e6 * drive.sampling.delay
+    often = f"every {number(own.slower * period)} µs"
+    blocks = [_block("position", often, rows[:1], "", "left")]
+    current: list[dict[str, Any]] = []
+    at = 3
+    for slot in own.slots:
+        part = rows[at : at + len(slot.settings)]
+        at += len(part)
+        block = _block(slot.name, "", part, f"{slot.name}, ")
+        (current if slot.place == "current" else blocks).append(block)
+    blocks.append(_block("velocity", f"every {number(period)} µs", rows[1:3], "", "right"))
+    blocks += [*current, _block("current loop", f"part of the delay, {number(late)} µs", [], "")]
+    blocks.append(_block("machine", "", [], ""))
+    y = 18
+    for block in blocks:
+        y += 44 if block["side"] else 16
+        block["y"], y = y, y + block["high"]
+    encoders = [
+        (30, 1, [f"encoder of {names[own.position]}"]),
+        (195, -1, [f"encoder of {names[own.velocity]}", f"difference over {number(period)} µs"]),
+    ]
+    svg = template("extensions/drives/templates/diagram.svg").render(
+        blocks=blocks, encoders=encoders, bottom=y + 33, high=y + 54
+    )
+    return c.Picture(svg)
+
+
+def _block(
+    title: str, note: str, rows: list[dict[str, Any]], prefix: str, side: str = ""
+) -> dict[str, Any]:
+    """A block; `side`: from where a sensor's signal comes in front of it."""
+    shown = [{"label": row["name"].removeprefix(prefix), "number": row["number"],
+              "new": f"{row['value']:.10g}", "unit": row["unit"],
+              "today": None if row["today"] is None else f"{row['today']:.10g}"}
+             for row in rows]  # fmt: skip
+    return {"title": title, "note": note, "rows": shown, "side": side,
+            "high": 22 + 14 * len(rows)}  # fmt: skip
+
+
+def _sensitivity(drive: DriveProblem, design: DriveDesign) -> c.Figure:
+    """|S| of the model at every place."""
+    uncertain, sampling, bounds = drive.uncertain, drive.sampling, drive.bounds
+    plant = uncertain.plant(uncertain.nominal).plant_si()
+    loop = lift(design.cascade, design.values, sampled(plant, sampling.period, sampling.delay))
+    low = bounds.omega_low / HZ
+    high = 0.499 / (sampling.period * design.cascade.slower)  # above it the position is aliased
+    hz = frequency_grid(low, high, 900, np.abs(plant.rates) / HZ)
+    curves = []
+    for place, colour in zip(loop.places, (BLUE, ORANGE, GREEN), strict=False):
+        name = "actuator" if place is None else (
+            bounds.channels[place].name if bounds.channels else "the sensor")  # fmt: skip
+        S = loop.sensitivity(place, HZ * hz)
+        curves.append(c.Curve(hz, S, f"broken at {name}", colour))
+    panel = sensitivity_panel(curves, (low, high), bounds.S_max,
+                              (bandwidth_level(design.bandwidth / HZ),), "|S| (–)")  # fmt: skip
+    words = "Of the model. Other plants of the set are judged and proven, not drawn."
+    return c.Figure(c.Lines(((panel,),), "Sensitivity over frequency", (3.4,)), words)
