@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 
 from ccd_casadi import inner
 from ccd_casadi.cases.diagnosis import _driven_away
+from ccd_casadi.fixed_structure.channel_structure import find_decoupling, is_decoupled
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Filters, Wiring
@@ -153,6 +154,94 @@ def test_a_set_has_derivatives_to_its_point(seed: int, ranged: bool) -> None:
         assert (np.abs(found - slope) < size).all(), uncertain.names[k]
 
 
+def machine(seed: int, channels: int = 1) -> Mechanics:
+    """Masses in a chain, free, on a spring or driven away, behind a coil and lags, as written."""
+    rng = np.random.default_rng(seed)
+    n, kind = int(rng.integers(channels, 4)), int(rng.integers(3))
+    joints = np.diff(np.eye(n), axis=0)
+    K = joints.T @ np.diag(10.0 ** rng.uniform(0.0, 4.0, n - 1)) @ joints
+    K[0, 0] += (0.0, 1.0, -1.0)[kind] * 10.0 ** rng.uniform(-1.0, 3.0)
+    mass, damping = 10.0 ** rng.uniform(-1.0, 1.0, n), 10.0 ** rng.uniform(-6.0, -4.0)
+    B = np.eye(n)[:, :channels] / mass[:, None]
+    A = np.block([[np.zeros((n, n)), np.eye(n)],
+                  [-K / mass[:, None], -damping * joints.T @ joints / mass[:, None]]])  # fmt: skip
+    B, C = np.vstack([0.0 * B, B]), np.hstack([np.eye(n)[:channels], np.zeros((channels, n))])
+    for _ in range(int(rng.integers(4))):  # a coil with its back-EMF, or a lag
+        rate, emf = 10.0 ** rng.uniform(1.0, 4.0), 10.0 ** rng.uniform(-1.0, 1.0) * rng.integers(2)
+        A = np.block([[A, B], [-emf * B.T, -rate * np.eye(channels)]])
+        B = np.vstack([0.0 * B, rate * np.eye(channels)])
+        C = np.hstack([C, np.zeros((channels, channels))])
+    return first_order_system(A, B, C)
+
+
+def first_order_system(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> Mechanics:
+    none = tuple(np.zeros((0, *part.shape)) for part in (A, A, A, B, C))
+    return Mechanics(0.0 * A, np.eye(len(A)), -A, B, C, None, none)
+
+
+def in_units(system: Mechanics, seed: int, decades: float) -> tuple[Mechanics, float, float]:
+    """The same in other units of every state, force, position and of time; M_K and ω₀ in these."""
+    rng = np.random.default_rng(seed)
+    x, (u, y, t) = (10.0 ** rng.uniform(-decades, decades, k) for k in (len(system.K), 3))
+    A, B, C = -t * system.K * x / x[:, None], t * system.B * u / x[:, None], y * system.C * x
+    return first_order_system(A, B, C), 1.0 / (u * y), t
+
+
+@few(max_examples=100)
+@given(seeds, st.integers(1, 2), st.floats(0.0, 8.0))
+def test_units_change_no_verdict(seed: int, channels: int, decades: float) -> None:
+    system = machine(seed, channels)
+    own, (other, force, time) = modal_plant(system, FREE), in_units(system, seed, decades)
+    moved = modal_plant(other, FREE)
+    one, states = own.states, moved.states
+    assert one is not None
+    assert states is not None
+    assert (states.bodies, states.integrators, states.resonances) == (
+        one.bodies, one.integrators, one.resonances,
+    )  # fmt: skip
+    assert states.leading[0] == one.leading[0]
+    before, after = (scale_plant(plant, M_K, bare=True)
+                     for plant, M_K in ((own, 1.0), (moved, force)))  # fmt: skip
+    assert after.omega_0 == pytest.approx(time * before.omega_0, rel=1e-9)
+    omega = np.geomspace(1e-2, 3.0, 15) * before.omega_0
+    expected = response(strictly_proper(-system.K, system.B, system.C), omega)
+    found = response(after.plant_si(), time * omega) * force
+    assert distance(found, expected) < 1e-6
+
+
+@few(max_examples=50)
+@given(seeds, st.floats(0.0, 8.0), st.sampled_from(["measured", "driven", "row", "double"]))
+def test_what_no_loop_holds_is_refused_in_any_units(seed: int, decades: float, what: str) -> None:
+    system = machine(seed)
+    n, none = len(system.K), np.zeros((1, 1))
+    loose = block_diag(-system.K, none), np.vstack([system.B, none]), np.hstack([system.C, none])
+    if what == "driven":
+        loose[2][0, n] = 1.0
+    if what == "measured":
+        loose[1][n] = 1.0
+    if what in ("row", "double"):
+        pole = 0.0 if what == "row" else -1.0
+        loose = (
+            block_diag(-system.K, pole * np.eye(3) + np.eye(3, k=1)),
+            np.vstack([system.B, np.eye(3)[:, 2:]]), np.hstack([system.C, np.eye(1, 3)]),
+        )  # fmt: skip
+    with pytest.raises(PlantError):
+        modal_plant(in_units(first_order_system(*loose), seed, decades)[0], FREE)
+
+
+def test_channels_of_alike_static_gains_are_found_free_or_held() -> None:
+    """Two axes, turned: of two equal gains no direction is that of the static gain."""
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    for held in (0.0, 1.0):
+        axes = [np.array([[0, 1.0, 0, 0], [-k - held, 0, k, 0], [0, 0, 0, 1.0], [k, 0, -k, -0.1]])
+                for k in (100.0, 400.0)]  # fmt: skip
+        B, C = np.kron(np.eye(2), np.eye(4)[:, [1]]), np.kron(np.eye(2), np.eye(1, 4))
+        system = first_order_system(block_diag(*axes), B @ turn.T, turn @ C)
+        found = find_decoupling(scaled(system, held=Suspension(0.01, 0.7)))
+        assert np.abs(np.abs(turn.T @ found.outputs).max(0) - 1.0).max() < 1e-9
+        assert is_decoupled(scaled(system), found)
+
+
 def as_first_order(theta: Mapping[str, Any], **options: Any) -> dict[str, Any]:
     """The two masses as ẋ = A x + B u."""
     found = dict(two_mass(theta, **options))
@@ -234,7 +323,7 @@ def model_of(**parts: Any) -> Plant:
         ({"B": None}, "returns A, C; add B"),
         ({"A": np.ones((2, 3))}, "make it square"),
         ({"D": np.ones((1, 1))}, "add the state of what rolls it off"),
-        ({"B": np.ones((3, 1))}, r"input is \(3, 1\)"),
+        ({"B": np.ones((3, 1))}, r"B is \(3, 1\); expected \(2, m\), .* as A is \(2, 2\)"),
     ],
 )
 def test_what_is_no_plant_of_first_order_is_refused(parts: dict[str, Any], words: str) -> None:
