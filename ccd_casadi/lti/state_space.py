@@ -244,7 +244,7 @@ def even_units(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array, float
     rate = own.sum(1) - own.sum(0)
     normal = np.block([[mean, rate[:, None]], [rate, own.sum()]])
     right = np.append(sizes.sum(1) - sizes.sum(0), sizes[:n].sum())
-    units = 2.0 ** np.round(np.linalg.lstsq(normal, right)[0])
+    units = np.exp2(np.round(np.linalg.lstsq(normal, right)[0]))
     return units[:n], units[n : n + m], units[n + m : -1], float(units[-1])
 
 

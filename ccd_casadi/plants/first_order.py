@@ -161,16 +161,23 @@ class FirstOrderPlant:
         system = replace(self.system, B=gain * self.system.B)
         return replace(self, system=system, slopes=slopes, leading=leading)
 
-    def off(self, shift: float, damping: float, single: Sequence[float]) -> "FirstOrderPlant":
-        """Off the model, with the derivatives that it has there; see the head of the module."""
-        if not shift and damping == 1.0 and not any(single):
+    def off(
+        self, shift: float, damping: float, single: Sequence[float], lost: float = 0.0
+    ) -> "FirstOrderPlant":
+        """Off the model, with the derivatives that it has there; see the head of the module.
+
+        The pairs lose a damping of `lost` |Im λ|, with which a controller is synthesised.
+        """
+        if not shift and damping == 1.0 and not any(single) and not lost:
             return self
         lam, r = self.rates, self.at_rest
-        ratio, decay = np.ones(len(lam)), np.ones(len(lam))
+        ratio, decay, less = np.ones(len(lam)), np.ones(len(lam)), np.zeros(len(lam))
         resonant = self.pairs[: self.resonances]
         for i, own in zip(resonant, [*single, *[0.0] * len(resonant)], strict=False):
-            ratio[self._both(i)], decay[self._both(i)] = (1.0 + shift) * (1.0 + own), damping
-        moved = ratio * (decay * lam.real + 1j * lam.imag)
+            both = self._both(i)
+            ratio[both], decay[both] = (1.0 + shift) * (1.0 + own), damping
+            less[both] = lost * np.sign(lam[both].imag)
+        moved = ratio * (decay * lam.real + (less + 1j) * lam.imag)
         (T, back), P = self._basis, self._turning()
         after = scipy.linalg.block_diag(self.system.A[:r, :r], np.diag(moved))
         kept = np.append(np.ones(r), 1.0 / ratio)
@@ -178,7 +185,9 @@ class FirstOrderPlant:
         own = E[:, r:, r:]
         dA = P @ after - after @ P
         dA[:, :r, :r] = E[:, :r, :r]
-        dA[:, r:, r:] += np.where(self._near, ratio * (decay * own.real + 1j * own.imag), 0.0)
+        dA[:, r:, r:] += np.where(
+            self._near, ratio * (decay * own.real + (less + 1j) * own.imag), 0.0
+        )  # fmt: skip
         dB = (P * kept - kept[:, None] * P) @ back @ self.system.B
         dB = dB + kept[:, None] * (back @ self.slopes.dB)
         A, B = ((T @ part).real for part in (after @ back, kept[:, None] * (back @ self.system.B)))
@@ -293,11 +302,11 @@ def first_order(
     upper = np.flatnonzero(lam.imag > 0.0)
     light = np.abs(lam[upper].real) < options.resonant * size[upper]
     order = np.lexsort((size[upper], ~light))
-    moved = Slopes(
+    slopes = Slopes(
         rate * back @ slopes.dA @ T, rate * back @ slopes.dB / u, y[:, None] * slopes.dC @ T
     )  # fmt: skip
     return FirstOrderPlant(
-        strictly_proper(rate * A, rate * B / u, y[:, None] * C), moved, n, k, rate * lam, V,
+        strictly_proper(rate * A, rate * B / u, y[:, None] * C), slopes, n, k, rate * lam, V,
         np.linalg.inv(V) if len(lam) else V,
         tuple(upper[order].tolist()), int(light.sum()), leading,
     )  # fmt: skip
