@@ -114,8 +114,9 @@ class FirstOrderPlant:
         return self.leading[1]
 
     def suspended(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
-        """The same with free bodies held by springs of ω in rad/s, or integrators by a leak. Raises
-        PlantError where it has both, whose states at rest are not one alone."""
+        """The same with free bodies held by springs of ω in rad/s, or integrators driven away with
+        ω: a controller cannot cancel these. Raises PlantError where it has both, whose states at
+        rest are not one alone."""
         n, r = self.bodies, self.at_rest
         if n and self.integrators:
             words = "mixed sensitivity cannot hold a free body and an integrator of one A"
@@ -123,7 +124,7 @@ class FirstOrderPlant:
         held = np.zeros_like(self.system.A)
         q, v, single = np.arange(n), np.arange(n, 2 * n), np.arange(2 * n, r)
         held[v, q], held[v, v] = -(omega**2), -2.0 * damping_ratio * omega
-        held[single, single] = -omega
+        held[single, single] = omega
         (T, back), P, C = self._basis, self._turning(), self.system.C
         E, read = self.slopes.dA, C[:, r:] @ self.V @ P[:, r:, v]
         P[:, v[:, None], q], P[:, v[:, None], v] = -E[:, q[:, None], q], -E[:, q[:, None], v]
