@@ -148,7 +148,8 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
             space = from_control(system)
             order, term = leading_term(space.A, space.B, space.C)
             least = bounds.omega_low / bounds.S_low  # rad/s: the bandwidth of an S of slope one
-            scale = (10.0 * least) ** order / np.linalg.norm(term, 2) if order else 1.0
+            gain = float(np.linalg.norm(term, 2))
+            scale = (10.0 * least) ** order / gain if order else 1.0
         scaled[i] = plant_from_control(system, scale)
     return scaled
 

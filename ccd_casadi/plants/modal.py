@@ -13,7 +13,7 @@ of them have 2 ζ_u ω less damping: a controller must then damp them, and canno
 is judged with either: every loop has them `free`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -96,7 +96,7 @@ class Perturbation:
     shift: float = 0.0
     damping: float = 1.0
     modes: tuple[float, ...] = ()
-    lost: float = 0.0
+    lost: float = field(default=0.0, kw_only=True)
 
 
 NOMINAL = Perturbation()
