@@ -87,7 +87,7 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.findings import Severity, Topic, peak_words
-    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.inner_problem.problem import notes_of
     from ccd_casadi.plants.registry import model_named
 
     model = model_named(case.plant.model)
@@ -106,7 +106,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
             of_case = item.topic in (Topic.UNITS, Topic.LOOP, Topic.UNUSED)
             subject = "" if of_case else "plant: "
             say(f"{item.severity.value}: {subject}{item.words}", sys.stderr)
-    for words in plant_of(problem).notes(problem.start):
+    for words in notes_of(problem, problem.start):
         say(f"note: {words}", sys.stderr)
 
 

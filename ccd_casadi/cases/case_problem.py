@@ -182,7 +182,7 @@ def _suspension(case: Case) -> Suspension:
     frequency = table.frequency_hz
     if frequency is None:
         frequency = min(softest.frequency_hz, 0.1 * case.inner.omega_low_hz)
-    return Suspension(frequency, table.damping_ratio, table.rigid_modes)
+    return Suspension(frequency, table.damping_ratio, table.rigid_modes, table.undamped)
 
 
 def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:

@@ -133,8 +133,7 @@ def diagnose(
             try:
                 system = mechanics(plant, theta, derivatives=index == 0)
                 modal = modal_plant(system, problem.suspension.free)
-                sections = isinstance(problem.controller, StructuredProblem)
-                require_damping(modal, by_loop=sections)
+                require_damping(modal)
                 scaled = scale_plant(without_hidden_rigid_modes(modal), problem.weights.M_K)
             except PlantError as error:
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"

@@ -39,11 +39,11 @@ def read_json(path: Path) -> Mapping[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file; solve the case first") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}; solve the case again") from None
+        raise UserError(f"{path}: cannot be read: {error.strerror}; make the run again") from None
     except (ValueError, RecursionError):
-        raise UserError(f"{path}: is not valid JSON; solve the case again") from None
+        raise UserError(f"{path}: is not valid JSON; make the run again") from None
     if not isinstance(found, dict):
-        raise UserError(f"{path}: holds no JSON object; solve the case again")
+        raise UserError(f"{path}: holds no JSON object; make the run again")
     return found
 
 
@@ -63,7 +63,7 @@ def number_of(
     """A number of a table between low and high, both left out; `key` is dotted, for messages."""
     value = table.get(key.rpartition(".")[2])
     if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        raise UserError(f"{path}: {key}: {words}; solve the case again")
+        raise UserError(f"{path}: {key}: {words}; make the run again")
     return float(value)
 
 
@@ -71,7 +71,7 @@ def theta_of(path: Path, result: Mapping[str, Any], problem: CoDesignProblem) ->
     """θ (n,) of result.json in SI, within the bounds of the problem."""
     table, values = result.get("theta"), []
     if not isinstance(table, dict) or set(table) != set(problem.names):
-        words = f"does not name {', '.join(problem.names)} as case.toml does; solve the case again"
+        words = f"does not name {', '.join(problem.names)} as case.toml does; make the run again"
         raise UserError(f"{path}: theta: {words}")
     for name, low, high in zip(problem.names, problem.lower, problem.upper, strict=True):
         words, slack = (
@@ -87,12 +87,12 @@ def controller_of(path: Path, plant: ScaledPlant) -> StateSpace:
     table, m, p = read_json(path), plant.B.shape[1], plant.C.shape[0]
     found: dict[str, Array] = {}
     for key in "ABCD":
-        with damaged(f"{path}: {key}", "is not a matrix; solve the case again"):
+        with damaged(f"{path}: {key}", "is not a matrix; make the run again"):
             found[key] = np.array(table[key], dtype=float)
             n = len(found["A"])
     for key, shape in {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}.items():
         if found[key].shape != shape or not np.isfinite(found[key]).all():
-            words = f"is not a finite matrix {shape} for this plant; solve the case again"
+            words = f"is not a finite matrix {shape} for this plant; make the run again"
             raise UserError(f"{path}: {key}: {words}")
     return StateSpace(*found.values())
 

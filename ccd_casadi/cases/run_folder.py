@@ -281,7 +281,7 @@ def _read_mixed(
     made = final_design(problem, theta, (HZ * hz[0], HZ * hz[1])).figures
     if made.certified and bound > made.certificate.norm_bound * (1.0 + options.gamma):
         words = f"is {bound:.6g}, and a synthesis reaches {made.certificate.norm_bound:.6g}"
-        raise UserError(f"{path}: certificate.norm_bound: {words}; solve the case again")
+        raise UserError(f"{path}: certificate.norm_bound: {words}; make the run again")
     figures = measure(
         plant, controller, weights,
         gamma=bound * (1.0 + options.norm),
@@ -290,12 +290,12 @@ def _read_mixed(
     )  # fmt: skip
     if not figures.certified:
         words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
-        raise UserError(f"{folder / 'controller.json'}: {words}; solve the case again")
+        raise UserError(f"{folder / 'controller.json'}: {words}; make the run again")
     for name, most in (("sensitivity_peak", "S_max"), ("sensitivity_low", "S_low")):
         found, own = getattr(figures, name), getattr(problem.inner, most)
         if result.get("status") == "verified" and not found <= own * (1.0 + options.bound):
             words = f"is verified, but {most} = {own:g} of case.toml is exceeded: {found:.6g}"
-            raise UserError(f"{path}: status: {words}; solve the case again")
+            raise UserError(f"{path}: status: {words}; make the run again")
     return {"weights": weights, "controller": controller, "figures": figures}
 
 
@@ -321,7 +321,7 @@ def _read_structured(
     judged = certify_corners(problem, theta, controller, kept if of_share else ())
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
-        raise UserError(f"{path}: {words}; solve the case again")
+        raise UserError(f"{path}: {words}; make the run again")
     problem = with_warm_start(problem, kappa)
     figures = _measured(problem, scaled_plant(problem, theta), controller, problem.weights)
     return {"problem": problem, "weights": problem.weights, "controller": controller,
@@ -352,7 +352,7 @@ def with_function(
     """
     if "anchors" not in result:
         return problem  # of an earlier version
-    words = "anchors, robust.set and seed are not those of a solve; solve the case again"
+    words = "anchors, robust.set and seed are not those of a solve; make the run again"
     with damaged(str(path), words):
         warm_starts, slower = (
             tuple(tuple(map(float, kappa)) for kappa in result.get(name, ()))
@@ -377,7 +377,7 @@ def _with_directions(
     if not isinstance(table, Mapping) or "channels" not in table:
         return problem
     own = {channel.name: channel for channel in structured.channels}
-    with damaged(f"{path}: sections.channels", "names no directions; solve the case again"):
+    with damaged(f"{path}: sections.channels", "names no directions; make the run again"):
         channels = tuple(
             replace(
                 own.get(str(item["name"]), ChannelProblem(str(item["name"]), structured.structure)),

@@ -191,6 +191,11 @@ class SuspensionTable:
     )
     damping_ratio: float = key("of these poles", 0.7)
     rigid_modes: int | None = key("required number of rigid-body modes; absent: any number", None)
+    undamped: float = key(
+        "damping ratio that modes lose in a mixed synthesis if one is undamped",
+        1e-3,
+        check=checks.number(1e-7, 0.1, "give a damping ratio between 1e-7 and 0.1"),
+    )
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
     design_choices,
+    notes_of,
     plant_of,
     scaled_plant,
     true_design,
@@ -91,7 +92,7 @@ class InnerOptions:
 def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
     """θ by name, what the hardware costs, and what a reader must know of the plant there."""
     return {
-        "notes": list(plant_of(problem).notes(theta)),
+        "notes": list(notes_of(problem, theta)),
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), theta),
     }

@@ -31,7 +31,7 @@ from ccd_casadi.codesign.verdict import (
     predicted,
 )
 from ccd_casadi.codesign.verified import Solution, Verified
-from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.problem import notes_of
 from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
@@ -119,7 +119,7 @@ def result_dict(
         ],
         "second_engine": verified.second.entry,
         "box_look": {} if global_check is None else global_check.entry,
-        "notes": list(plant_of(problem).notes(verified.theta)),
+        "notes": list(notes_of(problem, verified.theta)),
         "iterates": outcome.iterates,
         **run_entry(terms, spent, global_check is not None and global_check.moved),
         "surrogate_quality": quality_dict(quality),

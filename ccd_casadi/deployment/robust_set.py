@@ -150,7 +150,7 @@ def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
         model = tuple(item for item in values.items() if item[0].startswith("theta."))
         place = SetPlace(
             values.get("resonance_shift", 0.0), values.get("damping", 1.0),
-            modes if any(modes) else (), option, values.get("gain", 0.0), model,
+            modes if any(modes) else (), option=option, gain=values.get("gain", 0.0), varies=model,
         )  # fmt: skip
         found.setdefault(place, Member(place, uncertain.plant(point, option)))
     return tuple(found.values())

@@ -190,6 +190,7 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
     NOT_MODAL = "the plant is not modal: its damping couples the modes, or brakes a free body"
+    FIRST_ORDER = "the plant is given as A, B and C, whose poles are not enclosed"
     WIRED = (
         "channels have different actuators or sensors, or two of their poles coincide, so the set "
         "was searched"
@@ -197,8 +198,8 @@ class ProofOutcome(StrEnum):
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
 
 
-NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.WIRED,
-                  ProofOutcome.VARIES)  # fmt: skip
+NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.FIRST_ORDER,
+                  ProofOutcome.WIRED, ProofOutcome.VARIES)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -377,6 +378,7 @@ def prove(
         plant = modal_sum(uncertain, option, unit)
         if plant is None:
             why = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
+            why = ProofOutcome.FIRST_ORDER if uncertain.options[option].first_order else why
             return Proof(why, slack, names)
         families.append(family(
             plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay,

@@ -38,7 +38,8 @@ from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, search_from
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
+from ccd_casadi.lti.state_space import leading_term
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
@@ -145,8 +146,9 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
 
         if scale is None:
             space = from_control(system)
-            order, gain = leading_gain(space)
+            order, term = leading_term(space.A, space.B, space.C)
             least = bounds.omega_low / bounds.S_low  # rad/s: the bandwidth of an S of slope one
+            gain = float(np.linalg.norm(term, 2))
             scale = (10.0 * least) ** order / gain if order else 1.0
         scaled[i] = plant_from_control(system, scale)
     return scaled

@@ -13,7 +13,7 @@ import scipy
 from ccd_casadi.fixed_structure.bounds import BrokenAt, ChannelBounds
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.plants.scaling import ScaledPlant, singular_vectors
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -47,6 +47,9 @@ class Decoupling:
 def find_decoupling(plant: ScaledPlant, *, least_gain: float = 1e-9) -> Decoupling:
     """Find the channels of a square plant: the singular vectors of its static gain.
 
+    Where two of these gains are alike their directions say nothing; those in which the plant is
+    diagonal at every frequency are then taken, if there are any.
+
     Parameters
     ----------
     plant : ScaledPlant
@@ -71,20 +74,26 @@ def find_decoupling(plant: ScaledPlant, *, least_gain: float = 1e-9) -> Decoupli
         raise PlantError(words)
     static = -plant.C @ np.linalg.solve(plant.A, plant.B)
     blocks = [(c.outputs, c.inputs) for c in plant.channels] or [(np.eye(p), np.eye(m))]
-    outputs, inputs, gains = [], [], []
-    for out, into in blocks:
-        U, s, Vt = np.linalg.svd(out.T @ static @ into)
-        outputs.append(out @ U)
-        inputs.append(into @ Vt.T)
-        gains.append(s)
-    gain = np.concatenate(gains)
+    parts = [np.linalg.svd(out.T @ static @ into) for out, into in blocks]
+    pairs = [(out @ U, into @ Vt.T) for (out, into), (U, _, Vt) in zip(blocks, parts, strict=True)]
+    gain = np.concatenate([s for _, s, _ in parts])
     if not gain.min() > least_gain * gain.max():
         raise PlantError("does not move in every direction of its outputs; leave some of them out")
-    order = np.argsort(-gain, kind="stable")
-    U, V = np.hstack(outputs)[:, order], np.hstack(inputs)[:, order]
-    # One sign of two: the largest entry of a direction is positive.
-    sign = np.sign(U[np.abs(U).argmax(axis=0), np.arange(p)])
-    return Decoupling(tuple(str(i + 1) for i in range(p)), U * sign, V * sign)
+    found = _sorted_channels(static, *map(np.hstack, zip(*pairs, strict=True)))
+    if not plant.channels and not is_decoupled(plant, found):
+        real = plant.system.at(np.geomspace(1e-2, 1e2, 9)).real
+        U, _, Vt = singular_vectors(real / np.abs(real).max((1, 2), keepdims=True))
+        other = _sorted_channels(static, U, Vt.T)
+        found = other if is_decoupled(plant, other) else found
+    return found
+
+
+def _sorted_channels(static: Array, U: Array, V: Array) -> Decoupling:
+    """Directions by falling static gain, and of both signs that of a positive largest entry."""
+    order = np.argsort(-np.abs(np.einsum("pi,pm,mi->i", U, static, V)), kind="stable")
+    U, V = U[:, order], V[:, order]
+    sign = np.sign(U[np.abs(U).argmax(axis=0), np.arange(len(U))])
+    return Decoupling(tuple(str(i + 1) for i in range(len(U))), U * sign, V * sign)
 
 
 def given_decoupling(
@@ -286,7 +295,7 @@ def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
 
 def _coupled(whole: ScaledPlant, omega: Array, *, diagonal: float = 1e-7) -> bool:
     """Whether |G_ij| is above `diagonal` of the mean of |G_ii| and |G_jj| at some ω over ω₀."""
-    G = np.abs(whole.system.response(omega))
+    G = np.abs(whole.system.response(whole.system.off_poles(omega[omega > 0.0])))
     own = np.sqrt(np.einsum("kii->ki", G))
     coupling = G / np.maximum(own[:, :, None] * own[:, None, :], 1e-300)
     coupling[:, range(len(own[0])), range(len(own[0]))] = 0.0

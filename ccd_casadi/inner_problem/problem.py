@@ -124,6 +124,11 @@ class CoDesignProblem(NotebookHtml):
                 self.suspension.frequency_hz,
                 self.suspension.damping_ratio,
                 self.suspension.rigid_modes,
+                *(
+                    []
+                    if self.suspension.undamped == Suspension.undamped
+                    else [self.suspension.undamped]
+                ),
             ],
             "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u, *with_disturbance],
             "omega_low": self.inner.omega_low,
@@ -179,6 +184,29 @@ def plant_of(problem: CoDesignProblem) -> Plant:
     """
     use_units(*problem.spoken)
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
+
+
+def notes_of(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[str, ...]:
+    """List what a reader of a result must know of the plant.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+        θ in SI.
+
+    Returns
+    -------
+    tuple of str
+        Its own notes, and the damping that modes lose in a mixed synthesis.
+    """
+    plant, ratio = plant_of(problem), problem.suspension.undamped
+    notes = plant.notes(theta)
+    if not isinstance(problem.controller, MixedSensitivityProblem):
+        return notes
+    if not require_damping(free_modal(problem, mechanics(plant, theta, derivatives=False))):
+        return notes
+    words = f"a mode is not damped: K is synthesised with a damping ratio {ratio:g} less of each"
+    return (*notes, f"{words}, and judged without (suspension.undamped)")
 
 
 def with_ports(problem: CoDesignProblem) -> CoDesignProblem:
@@ -294,24 +322,25 @@ def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
     Returns
     -------
     ScaledPlant
-        Free bodies are free on every plant of its family but the one that controllers are made on.
+        Free bodies are free, and undamped modes are undamped, on every plant of its family but the
+        one that controllers are made on.
     """
     suspension, robust = problem.suspension, problem.robust
 
     def scaled(off: Perturbation, held: Suspension = suspension.free) -> ScaledPlant:
         modal = without_hidden_rigid_modes(modal_plant(system, held, off))
-        mixed = isinstance(problem.controller, MixedSensitivityProblem)
-        require_damping(modal, by_loop=not mixed)
         return scale_plant(modal, problem.weights.M_K)
 
     nominal = scaled(NOMINAL)
-    if robust is None and not nominal.free:
+    undamped = require_damping(free_modal(problem, system))
+    if robust is None and not nominal.free and not undamped:
         return nominal
     shift, others = 0.0, list[ScaledPlant]()
     if robust is not None:
         shift = robust.design_shift or 0.0
         others = [scaled(off) for off in robust.perturbations() if off != NOMINAL]
-    return replace(nominal, family=(scaled(Perturbation(shift), suspension), *others))
+    off = Perturbation(shift, lost=suspension.undamped if undamped else 0.0)
+    return replace(nominal, family=(scaled(off, suspension), *others))
 
 
 def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:

@@ -43,7 +43,8 @@ class CertifiedDesignOptions:
 
 @inlined
 def certificate_grid(wr, wi):
-    """Frequencies for the norm: 12 a decade beyond the poles, and every pole with its flanks."""
+    """Frequencies for the norm: 12 a decade beyond the poles, and every pole with its flanks, more
+    of a light one: beside an undamped mode of the plant two peaks share its width."""
     low, high = np.inf, 0.0
     n = wr.size
     for i in range(n):
@@ -51,7 +52,7 @@ def certificate_grid(wr, wi):
         low, high = min(low, size), max(high, size)
     low, high = np.log10(0.01 * low), np.log10(10.0 * high)
     count = int(np.ceil(12.0 * (high - low))) + 1
-    grid = np.empty(count + 3 * n)
+    grid = np.empty(count + 9 * n)
     for i in range(count):
         grid[i] = 10.0 ** (low + (high - low) * i / (count - 1))
     k = count
@@ -60,6 +61,10 @@ def certificate_grid(wr, wi):
             half = min(abs(wr[i]), 0.5 * wi[i])
             grid[k], grid[k + 1], grid[k + 2] = wi[i] - half, wi[i], wi[i] + half
             k += 3
+            if half < 0.02 * wi[i]:
+                for far in (0.5, 2.0, 4.0):
+                    grid[k], grid[k + 1] = wi[i] - far * half, wi[i] + far * half
+                    k += 2
     return np.sort(grid[:k])
 
 
@@ -181,7 +186,8 @@ def design(
         Above 0 it is the four-block problem with a disturbance, which is solved whole.
     judged_on : A, B, C
         Of the plant on which the loop is closed, with free bodies in the place of suspended ones.
-        Its norm may be above γ by `freed`; above that it is certified at its value.
+        Its norm may be above γ by `freed`; above that it is certified at its value, or where the
+        level test finds more than that, at `freed` above it.
     options : CertifiedDesignOptions
 
     Returns
@@ -205,8 +211,9 @@ def design(
                 gamma = backoff * row[_GAMMA_OPT] * (1.0 + options.freed if judged_on else 1.0)
                 loop = (*(judged_on or (A, B, C)), Ak, Bk, Ck, Dk, w, delta)
                 judge(*loop, gamma, omega_low, row)
-                if judged_on and row[_CODE] == Code.NORM_EXCEEDED:
-                    judge(*loop, (1.0 + options.level) * row[Column.NORM], omega_low, row)
+                for room in (options.level, options.freed):  # above a peak beside those found
+                    if judged_on and row[_CODE] in (Code.NORM_EXCEEDED, Code.LEVEL_TEST_FAILED):
+                        judge(*loop, (1.0 + room) * row[Column.NORM], omega_low, row)
         except np.linalg.LinAlgError:  # an infinite or undefined number on the way
             made = failed_row(), *[np.full((1, 1), nan)] * 3
         if made[0][_CODE] in _PASSED:

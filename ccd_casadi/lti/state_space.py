@@ -242,6 +242,65 @@ def state_scales(A: Array, B: Array, C: Array) -> Array:
     return np.asarray(scales[:n], float)
 
 
+def even_units(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array, float]:
+    """Find units in which the entries that are not 0 have sizes near 1, in the logarithm's mean.
+
+        min Σ (ln|aᵢⱼ| + tⱼ - tᵢ - ρ)² + Σ (ln|bᵢⱼ| + uⱼ - tᵢ - ρ)² + Σ (ln|cᵢⱼ| + tⱼ - yᵢ)²
+
+    Whatever diagonal units A, B and C are given in, they are the same in these. `state_scales`
+    leaves inputs and outputs as they are, and a cascade's couplings as small as it can.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+
+    Returns
+    -------
+    t (n,), u (m,), y (p,), rate
+        Of A t/t/rate, B u/t/rate and C t/y: powers of two.
+    """
+    n, m, p = len(A), B.shape[1], len(C)
+    whole = np.zeros((n + m + p, n + m + p))
+    whole[:n, :n], whole[:n, n : n + m], whole[n + m :, :n] = A, B, C
+    there, timed = 1.0 * (whole != 0.0), np.arange(len(whole)) < n
+    sizes = np.log2(np.where(whole, np.abs(whole), 1.0))
+    mean = np.diag(there.sum(0) + there.sum(1)) - there - there.T
+    own = (timed * there.T).T
+    rate = own.sum(1) - own.sum(0)
+    normal = np.block([[mean, rate[:, None]], [rate, own.sum()]])
+    right = np.append(sizes.sum(1) - sizes.sum(0), sizes[:n].sum())
+    units = np.exp2(np.round(np.linalg.lstsq(normal, right)[0]))
+    return units[:n], units[n : n + m], units[n + m : -1], float(units[-1])
+
+
+def leading_term(A: Array, B: Array, C: Array, *, rounding: float = 1e-13) -> tuple[int, Array]:
+    """Find the leading term C Aⁿ⁻¹ B/sⁿ of a plant at high frequencies.
+
+    A product is 0 where every entry is a rounding of the sum of its parts' sizes, |C||A|ⁿ⁻¹|B|:
+    no unit of a state, an input or an output changes that.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+    rounding : float
+        Relative size below which a product is 0.
+
+    Returns
+    -------
+    n : int
+        2 where C A B is not zero, else the first n whose term is not; 0 where the plant is 0.
+    term : array (p, m)
+        C Aⁿ⁻¹ B.
+    """
+    found, power, sizes = {}, B, np.abs(B)
+    for n in range(1, len(A) + 1):
+        if (np.abs(C @ power) > rounding * np.abs(C) @ sizes).any():
+            found[n] = C @ power
+        power, sizes = A @ power, np.abs(A) @ sizes
+    order = 2 if 2 in found else min(found, default=0)
+    return order, found.get(order, C @ B)
+
+
 def weighted(system: StateSpace, filters: Array) -> StateSpace:
     """Filter each output of a continuous system: through (s + zero)/(s + pole).
 

@@ -21,7 +21,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ccd_casadi.lti.state_space import StateSpace, state_scales, strictly_proper
+from ccd_casadi.lti.state_space import (
+    StateSpace,
+    even_units,
+    leading_term,
+    state_scales,
+    strictly_proper,
+)
 from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -79,6 +85,8 @@ class FirstOrderPlant:
         others, the slowest first of both.
     resonances : int
         How many are.
+    leading : int, array (p, m)
+        n and C Aⁿ⁻¹ B, see `leading_term`, of A, B and C as given: the zeros in them are exact.
     """
 
     system: StateSpace
@@ -90,6 +98,7 @@ class FirstOrderPlant:
     W: np.ndarray
     pairs: tuple[int, ...]
     resonances: int
+    leading: tuple[int, Array]
 
     @property
     def at_rest(self) -> int:
@@ -102,17 +111,12 @@ class FirstOrderPlant:
         A, B, C = self.system.A, self.system.B, self.system.C
         if not self.at_rest and (self.rates.real < 0.0).all():
             return -C @ np.linalg.solve(A, B)
-        sizes, power = np.linalg.norm(A, 2), B
-        for n in range(len(A)):
-            small = 1e-12 * sizes**n * np.linalg.norm(B) * np.linalg.norm(C)
-            if np.linalg.norm(C @ power) > small:
-                break
-            power = A @ power
-        return C @ power
+        return self.leading[1]
 
     def suspended(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
-        """The same with free bodies held by springs of ω in rad/s, or integrators by a leak. Raises
-        PlantError where it has both, whose states at rest are not one alone."""
+        """The same with free bodies held by springs of ω in rad/s, or integrators driven away with
+        ω: a controller cannot cancel these. Raises PlantError where it has both, whose states at
+        rest are not one alone."""
         n, r = self.bodies, self.at_rest
         if n and self.integrators:
             words = "mixed sensitivity cannot hold a free body and an integrator of one A"
@@ -120,7 +124,7 @@ class FirstOrderPlant:
         held = np.zeros_like(self.system.A)
         q, v, single = np.arange(n), np.arange(n, 2 * n), np.arange(2 * n, r)
         held[v, q], held[v, v] = -(omega**2), -2.0 * damping_ratio * omega
-        held[single, single] = -omega
+        held[single, single] = omega
         (T, back), P, C = self._basis, self._turning(), self.system.C
         E, read = self.slopes.dA, C[:, r:] @ self.V @ P[:, r:, v]
         P[:, v[:, None], q], P[:, v[:, None], v] = -E[:, q[:, None], q], -E[:, q[:, None], v]
@@ -154,18 +158,27 @@ class FirstOrderPlant:
     def driven(self, gain: float) -> "FirstOrderPlant":
         """With B times a factor."""
         slopes = self.slopes._replace(dB=gain * self.slopes.dB)
-        return replace(self, system=replace(self.system, B=gain * self.system.B), slopes=slopes)
+        leading = self.leading[0], gain * self.leading[1]
+        system = replace(self.system, B=gain * self.system.B)
+        return replace(self, system=system, slopes=slopes, leading=leading)
 
-    def off(self, shift: float, damping: float, single: Sequence[float]) -> "FirstOrderPlant":
-        """Off the model, with the derivatives that it has there; see the head of the module."""
-        if not shift and damping == 1.0 and not any(single):
+    def off(
+        self, shift: float, damping: float, single: Sequence[float], lost: float = 0.0
+    ) -> "FirstOrderPlant":
+        """Off the model, with the derivatives that it has there; see the head of the module.
+
+        The pairs lose a damping of `lost` |Im λ|, with which a controller is synthesised.
+        """
+        if not shift and damping == 1.0 and not any(single) and not lost:
             return self
         lam, r = self.rates, self.at_rest
-        ratio, decay = np.ones(len(lam)), np.ones(len(lam))
+        ratio, decay, less = np.ones(len(lam)), np.ones(len(lam)), np.zeros(len(lam))
         resonant = self.pairs[: self.resonances]
         for i, own in zip(resonant, [*single, *[0.0] * len(resonant)], strict=False):
-            ratio[self._both(i)], decay[self._both(i)] = (1.0 + shift) * (1.0 + own), damping
-        moved = ratio * (decay * lam.real + 1j * lam.imag)
+            both = self._both(i)
+            ratio[both], decay[both] = (1.0 + shift) * (1.0 + own), damping
+            less[both] = lost * np.sign(lam[both].imag)
+        moved = ratio * (decay * lam.real + (less + 1j) * lam.imag)
         (T, back), P = self._basis, self._turning()
         after = scipy.linalg.block_diag(self.system.A[:r, :r], np.diag(moved))
         kept = np.append(np.ones(r), 1.0 / ratio)
@@ -173,7 +186,9 @@ class FirstOrderPlant:
         own = E[:, r:, r:]
         dA = P @ after - after @ P
         dA[:, :r, :r] = E[:, :r, :r]
-        dA[:, r:, r:] += np.where(self._near, ratio * (decay * own.real + 1j * own.imag), 0.0)
+        dA[:, r:, r:] += np.where(
+            self._near, ratio * (decay * own.real + (less + 1j) * own.imag), 0.0
+        )  # fmt: skip
         dB = (P * kept - kept[:, None] * P) @ back @ self.system.B
         dB = dB + kept[:, None] * (back @ self.slopes.dB)
         A, B = ((T @ part).real for part in (after @ back, kept[:, None] * (back @ self.system.B)))
@@ -257,18 +272,24 @@ def first_order(
         A has three integrators in a row, is not diagonalisable beside its poles at 0, or has a free
         body or an integrator that is not driven or not measured.
     """
-    t = state_scales(A, B, C)
-    A, B, C = A * t / t[:, None], B / t[:, None], C * t
-    slopes = Slopes(slopes.dA * t / t[:, None], slopes.dB / t[:, None], slopes.dC * t)
-    T, back, n, k = _at_rest(A, C, options)
+    leading = leading_term(A, B, C)
+    t, u, y, rate = even_units(A, B, C)
+    A, B, C, *moved = (
+        part
+        for a, b, c in ((A, B, C), slopes)
+        for part in (a * t / t[:, None] / rate, b * u / t[:, None] / rate, c * t / y[:, None])
+    )
+    slopes = Slopes(*moved)
+    T, back, kept, n, k = _at_rest(A, C, options)
     r = 2 * n + k
     _require_seen(back[n:r] @ B, C @ np.delete(T[:, :r], np.s_[n : 2 * n], axis=1), B, C)
-    A, N = back @ A @ T, np.zeros((r, r))
+    A, N = np.hstack([T[:, :r], back @ A[:, kept]]), np.zeros((r, r))
     N[np.arange(n), np.arange(n, 2 * n)] = 1.0
     A[:r], A[:, :r], B, C = 0.0, 0.0, back @ B, C @ T
     A[:r, :r] = N
     s = state_scales(A, B, C)
     s[:r] = 1.0
+    s[n : 2 * n] = 1.0 / rate
     A, B, C = A * s / s[:, None], B / s[:, None], C * s
     T, back = T * s, back / s[:, None]
     lam, V = np.linalg.eig(A[r:, r:])
@@ -282,31 +303,40 @@ def first_order(
     upper = np.flatnonzero(lam.imag > 0.0)
     light = np.abs(lam[upper].real) < options.resonant * size[upper]
     order = np.lexsort((size[upper], ~light))
-    moved = Slopes(back @ slopes.dA @ T, back @ slopes.dB, slopes.dC @ T)
+    slopes = Slopes(
+        rate * back @ slopes.dA @ T, rate * back @ slopes.dB / u, y[:, None] * slopes.dC @ T
+    )  # fmt: skip
     return FirstOrderPlant(
-        strictly_proper(A, B, C), moved, n, k, lam, V, np.linalg.inv(V) if len(lam) else V,
-        tuple(upper[order].tolist()), int(light.sum()),
+        strictly_proper(rate * A, rate * B / u, y[:, None] * C), slopes, n, k, rate * lam, V,
+        np.linalg.inv(V) if len(lam) else V,
+        tuple(upper[order].tolist()), int(light.sum()), leading,
     )  # fmt: skip
 
 
-def _at_rest(A: Array, C: Array, options: FirstOrderOptions) -> tuple[Array, Array, int, int]:
-    """T and T⁻¹ with the states (q, v, integrators, others), and how many q and integrators.
+def _at_rest(
+    A: Array, C: Array, options: FirstOrderOptions
+) -> tuple[Array, Array, np.ndarray, int, int]:
+    """T and T⁻¹ with the states (q, v, integrators, others), which states the others are, and how
+    many q and integrators.
 
     v null on the left and q null on the right where the one does not see the other are a body:
-    A u = q for its velocity u. Where they see each other it is an integrator.
+    A u = q for its velocity u. Where they see each other it is an integrator. The others stay as
+    given, but for their part in these, and all is solved by elimination: zeros stay zeros.
     """
     n = len(A)
-    U, size, Vt = np.linalg.svd(A)
-    null = size <= options.at_rest * n * size.max(initial=0.0)
-    right, left = Vt[null].T, U[:, null].T
-    count = right.shape[1]
+    size = np.linalg.svd(A, compute_uv=False)
+    count = int((size <= options.at_rest * n * size.max(initial=0.0)).sum())
     if not count:
-        return np.eye(n), np.eye(n), 0, 0
+        return np.eye(n), np.eye(n), np.arange(n), 0, 0
+    right, left = _null(A, count), _null(A.T, count).T
     P, seen, Qt = np.linalg.svd(left @ right)
-    bodies = np.flatnonzero(seen <= 1e-9)
-    single = np.flatnonzero(seen > 1e-9)
+    if not (seen > 1e-9).any() or (seen > 1e-9).all():
+        P, Qt = np.eye(count), np.eye(count)
+    bodies, single = np.flatnonzero(seen <= 1e-9), np.flatnonzero(seen > 1e-9)
     q, v = right @ Qt[bodies].T, P[:, bodies].T @ left
-    rates, places = np.linalg.lstsq(A, q)[0], np.linalg.lstsq(A.T, v.T)[0].T
+    whole = np.block([[A, left.T], [right.T, np.zeros((count, count))]])
+    rates = np.linalg.solve(whole, np.vstack([q, 0.0 * right.T @ q]))[:n]
+    places = np.linalg.solve(whole.T, np.vstack([v.T, 0.0 * left @ v.T]))[:n].T
     rates -= q @ (np.linalg.pinv(C @ q) @ (C @ rates))  # sensors see positions, no velocities
     columns = np.hstack([q, rates, right @ Qt[single].T])
     rows = np.vstack([places, v, P[:, single].T @ left])
@@ -317,9 +347,27 @@ def _at_rest(A: Array, C: Array, options: FirstOrderOptions) -> tuple[Array, Arr
         )
         raise PlantError(f"{words}; give all others a rate, or use mass, damping and stiffness")
     rows = np.linalg.solve(pairing, rows)
-    rest = np.linalg.svd(rows)[2][len(rows) :].T
-    T = np.hstack([columns, rest])
-    return T, np.linalg.inv(T), len(bodies), len(single)
+    given, kept = _chosen(columns.T)
+    T = np.hstack([columns, np.eye(n)[:, kept] - columns @ rows[:, kept]])
+    parted = np.eye(n)[kept] - columns[kept] @ np.linalg.solve(columns[given], np.eye(n)[given])
+    return T, np.vstack([rows, parted]), kept, len(bodies), len(single)
+
+
+def _chosen(rows: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of columns in which rows (r, n) are best known, and of the others."""
+    order = scipy.linalg.qr(rows, mode="r", pivoting=True)[1]
+    return order[: len(rows)], np.sort(order[len(rows) :])
+
+
+def _null(A: Array, count: int) -> Array:
+    """x (n, count) of A x = 0: some of its entries are chosen, the others are solved for."""
+    n = len(A)
+    free = np.sort(scipy.linalg.qr(A, mode="r", pivoting=True)[1][n - count :])
+    bound, rows = np.delete(np.arange(n), free), np.sort(_chosen(np.delete(A, free, axis=1).T)[0])
+    x = np.zeros((n, count))
+    x[free] = np.eye(count)
+    x[bound] = -np.linalg.solve(A[np.ix_(rows, bound)], A[np.ix_(rows, free)])
+    return x / np.linalg.norm(x, axis=0)
 
 
 def _require_seen(

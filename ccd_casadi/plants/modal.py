@@ -7,12 +7,13 @@ on the eigenvalues λ = ω². Their derivatives follow from divided differences,
 
 which is exact at double eigenvalues too. Rigid is what K does not resist (`rigid_modes`): poles at
 zero. A motion that K drives away has λ < 0 and poles ±√-λ; a damping ratio says nothing of it and
-damps none. On the axis poles at zero would make the mixed-sensitivity problem singular, so that a
-synthesis has a suspension that puts them at (ω_r, ζ_r). Nothing is judged with it: every loop has
-them `free`.
+damps none. On the axis poles would make the mixed-sensitivity problem singular, so that a synthesis
+has a suspension that puts those at zero at (ω_r, ζ_r), and where a flexible mode is not damped all
+of them have 2 ζ_u ω less damping: a controller must then damp them, and cannot cancel them. Nothing
+is judged with either: every loop has them `free`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -57,15 +58,18 @@ class Suspension:
         Damping ratio.
     rigid_modes : int, optional
         Number of rigid-body modes, where the case states it; see `rigid_modes.natural_modes`.
+    undamped : float
+        ζ_u, the damping ratio that flexible modes lose where one is not damped.
     """
 
     frequency_hz: float = 0.1
     damping_ratio: float = 0.7
     rigid_modes: int | None = None
+    undamped: float = 1e-3
 
     @property
     def free(self) -> "Suspension":
-        """The same without suspension: rigid-body poles stay at zero, as the machine has them."""
+        """The same without suspension: poles stay where the machine has them."""
         return replace(self, frequency_hz=0.0, damping_ratio=0.0)
 
 
@@ -85,11 +89,14 @@ class Perturbation:
     modes : tuple of float
         Further relative shifts of single flexible modes, in the order of `numbered`; the modes
         beyond its end are not shifted.
+    lost : float
+        Damping ratio that every flexible mode loses, after all this.
     """
 
     shift: float = 0.0
     damping: float = 1.0
     modes: tuple[float, ...] = ()
+    lost: float = field(default=0.0, kw_only=True)
 
 
 NOMINAL = Perturbation()
@@ -205,7 +212,8 @@ def modal_plant(
     ratio = (1.0 + perturbation.shift) * (1.0 + own)
     h = np.where(rigid, w_r**2, ratio**2 * lam)
     model = system.damping_ratio or 0.0
-    zeta = model * perturbation.damping * ratio  # of the model's own root: g is a function of λ
+    # of the model's own root: g is a function of λ
+    zeta = (model * perturbation.damping - perturbation.lost) * ratio
     zeta = np.where(driven_away, 0.0, zeta)  # of an ω: a motion that K drives away has none
     g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
 
@@ -246,7 +254,7 @@ def _of_states(system: Mechanics, held: Suspension, off: Perturbation) -> ModalP
     """A plant of first order, with its poles as modes without derivatives."""
     _, _, dK, dB, dC = system.derivatives
     states = first_order(-system.K, system.B, system.C, Slopes(-dK, dB, dC))
-    states = states.off(off.shift, off.damping, off.modes)
+    states = states.off(off.shift, off.damping, off.modes, off.lost)
     if held.frequency_hz:
         states = states.suspended(2.0 * np.pi * held.frequency_hz, held.damping_ratio)
     k, d, B, C, rigid, _ = states.modes()
@@ -290,42 +298,39 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     return replace(modal, **both, **drive, **shown, **left)
 
 
-def require_damping(
-    modal: ModalPlant, *, by_loop: bool = False, options: ModalOptions = ModalOptions()
-) -> None:
-    """Check that every flexible mode is damped: the gain of an undamped one is infinite.
+def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()) -> bool:
+    """Check that every flexible mode is damped, or that a loop may damp it.
 
     Parameters
     ----------
     modal : ModalPlant
-    by_loop : bool
-        Whether the loop may damp what is driven and measured, as one with sections does.
     options : ModalOptions
+
+    Returns
+    -------
+    bool
+        Whether some mode is not damped, which is driven and measured.
 
     Raises
     ------
     PlantError
-        The message names the frequency in Hz and the remedy.
+        A mode is not damped and the loop does not reach it, or has a negative damping. The message
+        names its frequency in Hz and the remedy.
     """
     damping, natural = np.diag(modal.D), modal.natural
     rigid = modal.rigid | modal.driven_away  # neither has a resonance
     least = options.undamped * max(float(np.abs(damping[~rigid]).max(initial=0.0)), 1e-300)
-    wrong = np.flatnonzero(~rigid & (damping <= least))
-    if not wrong.size:
-        return
+    undamped = ~rigid & (damping <= least)
     sizes = (np.linalg.norm(part, axis=1) for part in (modal.B, modal.C.T))
     seen = np.logical_and(*(size > options.equal_outputs * size.max() for size in sizes))
-    if by_loop:
-        wrong = wrong[~seen[wrong] | (damping[wrong] < -least)]
-        if not wrong.size:
-            return
+    wrong = np.flatnonzero(undamped & (~seen | (damping < -least)))
+    if not wrong.size:
+        return bool(undamped.any())
     i = wrong[0]
     words = "is not damped" if damping[i] >= -least else "has a negative damping"
-    holds = "the loop does not reach it" if by_loop else "no synthesis holds an infinite resonance"
-    remedy = "" if by_loop else ', or use controller.structure = "sections"'
     raise PlantError(
-        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: {holds}; return a damping "
-        f"matrix that reaches it, or damping_ratio, such as 0.005{remedy}"
+        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: the loop does not reach it; "
+        "return a damping matrix that reaches it, or damping_ratio, such as 0.005"
     )
 
 

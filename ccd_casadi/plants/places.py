@@ -205,7 +205,7 @@ class PlacedMechanics:
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         values = np.asarray(theta, float)
-        below = self.evaluate(tuple(values[self.own].tolist()))
+        below = self.evaluate(tuple(values[self.own].tolist())).with_mass("[places]")
         count = len(values) if len(below.derivatives[0]) or not self.own else 0
 
         def spread(slopes: Array) -> Array:
@@ -285,7 +285,7 @@ class PlacedMechanics:
 
 def _flexible(system: Mechanics) -> tuple[Array, Array]:
     """ω in rad/s and shapes, as columns, of the flexible modes."""
-    lam, modes, rigid = natural_modes(system.with_mass("[places]").K, system.M)
+    lam, modes, rigid = natural_modes(system.K, system.M)
     return np.sqrt(lam[~rigid]), modes[:, ~rigid]
 
 

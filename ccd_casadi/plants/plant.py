@@ -288,7 +288,7 @@ def model_parts(
     if not isinstance(result, Mapping):
         words = "returned None" if result is None else f"returned a {type(result).__name__}"
         raise PlantError(f"the plant function {words}; let it return a mapping, such as a dict")
-    result = _of_mechanics(result)
+    first_order, result = "A" in result, _of_mechanics(result)
     constraints = result.get("constraints", {})
     if not isinstance(constraints, Mapping):
         words = f"constraints is a {type(constraints).__name__}; return a mapping of name to value"
@@ -321,7 +321,7 @@ def model_parts(
             raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
     ports = {key: _converted(kind, key, result[key]) for key in PORTS if key in result}
-    _check_shapes(M, D, K, B, C, ports)
+    _check_shapes(M, D, K, B, C, ports, first_order)
     ratio = _damping_ratio(result.get("damping_ratio"))
     for key, value in constraints.items():
         if _is_comparison(value):
@@ -393,14 +393,17 @@ def _converted(kind: Any, key: str, value: object) -> Any:
     return kind(value)
 
 
-def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, Any]) -> None:
+def _check_shapes(
+    M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, Any], first_order: bool
+) -> None:
     """Raise PlantError unless M, D, K are (n, n), B (n, m), C (p, n), and ports not 0."""
-    n = M.shape[0]
+    n, rows = M.shape[0], "A" if first_order else "mass"
     for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
         if matrix.shape != (n, n):
             raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
-    wanted = [("input", B, 0, f"({n}, m), a column a force"),
-              ("output", C, 1, f"(p, {n}), a row a sensor")]  # fmt: skip
+    drive, reading = ("B", "C") if first_order else ("input", "output")
+    wanted = [(drive, B, 0, f"({n}, m), a column a force"),
+              (reading, C, 1, f"(p, {n}), a row a sensor")]  # fmt: skip
     wanted += [(key, matrix, int(key == "performance"), form)
                for key, matrix in ports.items()
                for form in [f"({n}, q), a column a force" if key == "disturbance"
@@ -408,7 +411,7 @@ def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any, ports: Mapping[str, An
     for key, matrix, side, form in wanted:
         if matrix.shape[side] != n:
             remedy = "transpose it" if matrix.shape[1 - side] == n else f"make it {n} on that side"
-            words = f"{key} is {matrix.shape}; expected {form}, as mass is {M.shape}"
+            words = f"{key} is {matrix.shape}; expected {form}, as {rows} is {M.shape}"
             raise PlantError(f"{words}: {remedy}")
     for key, matrix in ports.items():
         entries: list[Any] = ca.SX(matrix).elements()

@@ -8,7 +8,13 @@ import scipy
 
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
-from ccd_casadi.lti.state_space import StateSpace, balanced, state_scales, strictly_proper
+from ccd_casadi.lti.state_space import (
+    StateSpace,
+    balanced,
+    leading_term,
+    state_scales,
+    strictly_proper,
+)
 from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import ModalPlant
@@ -77,7 +83,7 @@ def find_channels(
             for j in group
             if c[i] * b[j] > options.driven * scale
         ]
-    U, s, Vt = _singular_vectors(np.array(residues), options.mixtures)
+    U, s, Vt = singular_vectors(np.array(residues), options.mixtures)
     if s[-1] <= options.exact * s[0]:
         return whole
     turned = [np.abs(U.T @ residue @ Vt.T) for residue in residues]
@@ -96,11 +102,23 @@ def find_channels(
     return tuple(found)
 
 
-def _singular_vectors(residues: Array, mixtures: int) -> tuple[Array, Array, Array]:
-    """Those of the mixture, of some, whose singular values lie furthest apart.
+def singular_vectors(
+    residues: Array, mixtures: int = ChannelSplitOptions.mixtures
+) -> tuple[Array, Array, Array]:
+    """Find the directions in which matrices are diagonal together, where they are in any.
 
-    Any mixture will do but for rounding, which grows as two of them meet; the seed is fixed, so
-    that the same plant has the same channels.
+    Those of the mixture of them, of some, whose singular values lie furthest apart. Any mixture
+    will do but for rounding, which grows as two values meet; the seed is fixed, so that the same
+    plant has the same channels.
+
+    Parameters
+    ----------
+    residues : array (k, p, m)
+    mixtures : int
+
+    Returns
+    -------
+    U (p, p), s, Vᵀ (m, m)
     """
     rng = np.random.default_rng(0)
     found = [
@@ -320,7 +338,7 @@ def _scaled_states(
 ) -> ScaledPlant:
     """A plant of first order; ω₀ as `scale_state_space` has it, free bodies alike."""
     system, n, r = states.system, states.bodies, states.at_rest
-    omega_0 = _unit_of_frequency(system, M_K)
+    omega_0 = _unit_of_frequency(states.leading, M_K)
     A, B, C = system.A / omega_0, system.B * (M_K / omega_0), system.C
     t = np.append(np.ones(r), state_scales(A[r:, r:], B[r:], C[:, r:]))
     t[:r] /= np.linalg.norm(C[:, :r]) or 1.0
@@ -352,7 +370,7 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
         raise PlantError("its state space is not finite")
     if np.any(system.D):
         raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
-    omega_0 = _unit_of_frequency(system, M_K)
+    omega_0 = _unit_of_frequency(leading_term(system.A, system.B, system.C), M_K)
     A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
     grid, gain = _gains(A, B, C)
     poles = np.linalg.eigvals(system.A)
@@ -361,41 +379,12 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
 
 
-def _unit_of_frequency(system: StateSpace, M_K: float) -> float:
+def _unit_of_frequency(leading: tuple[int, Array], M_K: float) -> float:
     """ω₀ in rad/s; see `scale_state_space`."""
-    order, inertial = leading_gain(system)
+    order, term = leading
     if not order:
         raise PlantError("C Aⁿ B is zero for every n: no force accelerates what is measured")
-    return float((M_K * inertial) ** (1.0 / order))
-
-
-def leading_gain(system: StateSpace, *, rounding: float = 1e-13) -> tuple[int, float]:
-    """Find the leading term C Aⁿ⁻¹ B/sⁿ of a plant at high frequencies.
-
-    Parameters
-    ----------
-    system : StateSpace
-        D = 0, SI.
-    rounding : float
-        Relative size below which a product is zero.
-
-    Returns
-    -------
-    n : int
-        2 where C A B is not zero, else the first n whose term is not; 0 where the plant is 0.
-    gain : float
-        ‖C Aⁿ⁻¹ B‖; 0 where the plant is 0.
-    """
-    A, B, C = balanced(system.A, system.B, system.C)
-    sizes = [float(np.linalg.norm(M, 2)) for M in (C, A, B)]
-    found, power = {}, B
-    for n in range(1, len(A) + 1):
-        size = float(np.linalg.norm(C @ power, 2))
-        if size > rounding * sizes[0] * sizes[1] ** (n - 1) * sizes[2]:
-            found[n] = size
-        power = A @ power
-    order = 2 if 2 in found else min(found, default=0)
-    return order, found.get(order, 0.0)
+    return float((M_K * np.linalg.norm(term, 2)) ** (1.0 / order))
 
 
 def _scaled_channels(

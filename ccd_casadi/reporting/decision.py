@@ -23,11 +23,12 @@ from ccd_casadi.reporting.concerns import (
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 NEXT = {  # what to do about a line that failed, or about what the decision names
-    "certified": "solve the case again",
+    "certified": "make the run again",
     "optimal": "more starts or box_points in [outer]",
     "predicted": "retrain, or more points in [sampling]",
     "survives": "a [robust] set in the case",
     "wider": "a wider resonance_shift or damping in [robust]",
+    "narrower": "a smaller [robust] set, or looser bounds",
     "deployable": "a higher rate or less delay",
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which goes on from what is stored",
@@ -201,8 +202,7 @@ def decide(result: Mapping[str, Any]) -> Decision:
                Reason.SURVIVAL_UNKNOWN: Build.NOT_YET}  # fmt: skip
     for concern in survival:
         if concern.reason in against:
-            kept = result["verdict"]["survives"].get("set") == OwnSet.KEPT
-            step = NEXT["wider" if kept else "survives"]
+            step = _next_of_survival(result["verdict"]["survives"])
             return Decision(against[concern.reason], (concern,), (step,), beside)
     if move:
         return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
@@ -287,8 +287,18 @@ def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Con
 def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
     """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
     line = result["verdict"][name]
+    if name == "survives":
+        return _next_of_survival(line)
     rate_helps = line.get("needed_hz", 0.0) is not None
     return NEXT[name] if name != "deployable" or rate_helps else "less delay"
+
+
+def _next_of_survival(line: Mapping[str, Any]) -> str:
+    """A set where the case names none; a smaller one where it is broken, also by a share of
+    machines; else a wider one."""
+    own = line.get("set") or (OwnSet.BROKEN if "share" in line else OwnSet.NONE)
+    names = {OwnSet.NONE: "survives", OwnSet.BROKEN: "narrower"}
+    return NEXT[names.get(own, "wider")]
 
 
 def _unstable_controller(result: Mapping[str, Any]) -> str:

@@ -48,7 +48,8 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
     assert (inner.S_max, inner.S_low, inner.omega_low_hz) == (1.75, 0.03, 1.0)
     assert (inner.omega_S_hz, inner.omega_T_hz) == ((10.0, 1800.0), (25.0, 1000.0))
     assert (inner.gamma_backoff, inner.sweep_points) == (1.02, (20, 20))
-    suspension = {"frequency_hz": None, "damping_ratio": 0.7, "rigid_modes": None}
+    suspension = {"frequency_hz": None, "damping_ratio": 0.7, "rigid_modes": None,
+                  "undamped": 1e-3}  # fmt: skip
     assert vars(case.suspension) == suspension
     assert (case.sampling.design, case.sampling.points) == ("grid", 5)
     assert (case.outer.starts, case.outer.tolerance, case.outer.max_refinements) == (16, 1e-3, 12)

@@ -82,7 +82,7 @@ def test_a_damaged_file_is_named(
         )
     )
     (folder / name).write_bytes(text)
-    with pytest.raises(UserError, match="solve the case"):
+    with pytest.raises(UserError, match="make the run again"):
         read_run(folder)
     (folder / name).unlink()
     with pytest.raises(UserError, match="there is no such file"):

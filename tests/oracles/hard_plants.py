@@ -294,7 +294,8 @@ def far_from_sb10ad(plant: ScaledPlant, own: ScaledPlant, weights: Weights) -> f
     if figures.gamma_opt > 1e3:  # zeros beside unstable poles: rounding decides
         return np.nan
     assert figures.certificate.passed, figures.outcome
-    assert len(done.controller.A) == len(plant.A) + 3 * len(plant.C)  # as of a stable plant
+    outputs, inputs = len(plant.C), plant.B.shape[1]
+    assert len(done.controller.A) == len(plant.A) + 2 * outputs + inputs  # as of a stable plant
     standard, K = balance(mixed_sensitivity(own, weights)), done.controller
     norm = hinf_norm(close(standard, StateSpace(K.A / w0, K.B / w0, K.C, K.D)))[0]
     assert norm <= figures.certificate.norm_bound * (1.0 + 1e-8)

@@ -10,7 +10,7 @@ from oracles.helpers import few
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.reporting.brief_risks import risks
 from ccd_casadi.reporting.concerns import ConditionOptions, Reason, resonance_condition
-from ccd_casadi.reporting.decision import Build, advice, decide
+from ccd_casadi.reporting.decision import NEXT, Build, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 
@@ -47,6 +47,18 @@ def test_a_move_that_does_not_settle_within_its_limit_is_in_every_decision(state
         assert "Next: " in words
         if before.startswith("Do not"):  # whose reason stays the first
             assert words.startswith(before.partition(".")[0])
+
+
+@pytest.mark.parametrize("state", ["failed", "warned", "unknown"])
+@pytest.mark.parametrize("own", [None, *OwnSet])
+def test_a_set_is_advised_only_where_the_case_names_none(state: str, own: OwnSet | None) -> None:
+    result = result_of(survives=state)
+    result["verdict"]["survives"]["set"] = own
+    none = own in (None, OwnSet.NONE)
+    assert none or NEXT["survives"] not in advice(result)
+    assert not (none and state == "failed") or NEXT["survives"] in advice(result)
+    result["verdict"]["survives"] = {"state": state, "words": "", "share": 0.999}
+    assert NEXT["survives"] not in advice(result)
 
 
 @given(

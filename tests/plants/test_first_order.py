@@ -14,10 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.hard_plants import drawn_weights, far_from_sb10ad
 from oracles.helpers import few
+from oracles.wired_plants import first_order_system, machine
 from scipy.linalg import block_diag
 
 from ccd_casadi import inner
 from ccd_casadi.cases.diagnosis import _driven_away
+from ccd_casadi.fixed_structure.channel_structure import find_decoupling, is_decoupled
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Filters, Wiring
@@ -31,6 +33,7 @@ from ccd_casadi.plants.modal import (
     modal_plant,
     require_damping,
 )
+from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, PlantMode, facts_of
 from ccd_casadi.plants.registry import two_mass
@@ -126,7 +129,7 @@ def test_derivatives_are_those_of_the_response(
     assert distance(found, slope) < 1e-4
 
 
-@few(max_examples=10)
+@few(max_examples=6)
 @given(seeds, st.booleans())
 def test_a_set_has_derivatives_to_its_point(seed: int, ranged: bool) -> None:
     """Also to a parameter of the model itself, which comes last."""
@@ -151,6 +154,69 @@ def test_a_set_has_derivatives_to_its_point(seed: int, ranged: bool) -> None:
         found = dC @ R @ own.B + own.C @ R @ (dA @ R @ own.B + dB)
         size = 1e-4 * np.abs(slope) + 1e-6 * np.abs(response(own, OMEGA))
         assert (np.abs(found - slope) < size).all(), uncertain.names[k]
+
+
+def in_units(system: Mechanics, seed: int, decades: float) -> tuple[Mechanics, float, float]:
+    """The same in other units of every state, force, position and of time; M_K and ω₀ in these."""
+    rng = np.random.default_rng(seed)
+    x, (u, y, t) = (10.0 ** rng.uniform(-decades, decades, k) for k in (len(system.K), 3))
+    A, B, C = -t * system.K * x / x[:, None], t * system.B * u / x[:, None], y * system.C * x
+    return first_order_system(A, B, C), 1.0 / (u * y), t
+
+
+@few(max_examples=40)
+@given(seeds, st.integers(1, 2), st.floats(0.0, 8.0))
+def test_units_change_no_verdict(seed: int, channels: int, decades: float) -> None:
+    system = machine(seed, channels=channels).system
+    own, (other, force, time) = modal_plant(system, FREE), in_units(system, seed, decades)
+    moved = modal_plant(other, FREE)
+    one, states = own.states, moved.states
+    assert one is not None
+    assert states is not None
+    assert (states.bodies, states.integrators, states.resonances) == (
+        one.bodies, one.integrators, one.resonances,
+    )  # fmt: skip
+    assert states.leading[0] == one.leading[0]
+    before, after = (scale_plant(plant, M_K, bare=True)
+                     for plant, M_K in ((own, 1.0), (moved, force)))  # fmt: skip
+    assert after.omega_0 == pytest.approx(time * before.omega_0, rel=1e-9)
+    omega = np.geomspace(1e-2, 3.0, 15) * before.omega_0
+    expected = response(strictly_proper(-system.K, system.B, system.C), omega)
+    found = response(after.plant_si(), time * omega) * force
+    assert distance(found, expected) < 1e-6
+
+
+@few(max_examples=50)
+@given(seeds, st.floats(0.0, 8.0), st.sampled_from(["measured", "driven", "row", "double"]))
+def test_what_no_loop_holds_is_refused_in_any_units(seed: int, decades: float, what: str) -> None:
+    system = machine(seed).system
+    n, none = len(system.K), np.zeros((1, 1))
+    loose = block_diag(-system.K, none), np.vstack([system.B, none]), np.hstack([system.C, none])
+    if what == "driven":
+        loose[2][0, n] = 1.0
+    if what == "measured":
+        loose[1][n] = 1.0
+    if what in ("row", "double"):
+        pole = 0.0 if what == "row" else -1.0
+        loose = (
+            block_diag(-system.K, pole * np.eye(3) + np.eye(3, k=1)),
+            np.vstack([system.B, np.eye(3)[:, 2:]]), np.hstack([system.C, np.eye(1, 3)]),
+        )  # fmt: skip
+    with pytest.raises(PlantError):
+        modal_plant(in_units(first_order_system(*loose), seed, decades)[0], FREE)
+
+
+def test_channels_of_alike_static_gains_are_found_free_or_held() -> None:
+    """Two axes, turned: of two equal gains no direction is that of the static gain."""
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    for held in (0.0, 1.0):
+        axes = [np.array([[0, 1.0, 0, 0], [-k - held, 0, k, 0], [0, 0, 0, 1.0], [k, 0, -k, -0.1]])
+                for k in (100.0, 400.0)]  # fmt: skip
+        B, C = np.kron(np.eye(2), np.eye(4)[:, [1]]), np.kron(np.eye(2), np.eye(1, 4))
+        system = first_order_system(block_diag(*axes), B @ turn.T, turn @ C)
+        found = find_decoupling(scaled(system, held=Suspension(0.01, 0.7)))
+        assert np.abs(np.abs(turn.T @ found.outputs).max(0) - 1.0).max() < 1e-9
+        assert is_decoupled(scaled(system), found)
 
 
 def as_first_order(theta: Mapping[str, Any], **options: Any) -> dict[str, Any]:
@@ -234,12 +300,20 @@ def model_of(**parts: Any) -> Plant:
         ({"B": None}, "returns A, C; add B"),
         ({"A": np.ones((2, 3))}, "make it square"),
         ({"D": np.ones((1, 1))}, "add the state of what rolls it off"),
-        ({"B": np.ones((3, 1))}, r"input is \(3, 1\)"),
+        ({"B": np.ones((3, 1))}, r"B is \(3, 1\); expected \(2, m\), .* as A is \(2, 2\)"),
     ],
 )
 def test_what_is_no_plant_of_first_order_is_refused(parts: dict[str, Any], words: str) -> None:
     with pytest.raises(PlantError, match=words):
         model_of(**parts)
+
+
+def test_places_are_refused_where_no_mass_is_given() -> None:
+    """Neither a mass that moves along nor a sensor's row is known of A, B and C."""
+    plant = replace(drawn(0), inputs=3)
+    moved = placed(plant, Places(((0.0,), (1.0,), (2.0,)), ((0.5,),)), ["p"])
+    with pytest.raises(PlantError, match=r"\[places\] needs a plant function that returns mass"):
+        mechanics(moved, THETA)
 
 
 @pytest.mark.parametrize(
@@ -259,8 +333,9 @@ def test_poles_that_cannot_be_told_apart_are_refused(A: np.ndarray, words: str) 
         modal_plant(system, FREE)
 
 
-def test_an_undamped_pair_is_refused_by_its_frequency() -> None:
-    system = mechanics(model_of(A=np.array([[0.0, 62.8318], [-62.8318, 0.0]])), (0.5,))
+def test_an_undamped_pair_that_no_loop_reaches_is_refused_by_its_frequency() -> None:
+    A = block_diag(np.array([[0.0, 62.8318], [-62.8318, 0.0]]), [[-1.0]])
+    system = mechanics(model_of(A=A, B=np.ones((3, 1)), C=np.eye(1, 3, 2)), (0.5,))
     with pytest.raises(PlantError, match="mode at 10 Hz is not damped"):
         require_damping(modal_plant(system, FREE))
 
