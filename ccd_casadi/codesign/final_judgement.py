@@ -164,17 +164,6 @@ class RobustCheck:
     plants: int
     passed: bool
 
-    @property
-    def words(self) -> str:
-        """Whether the set is kept, and where it is worst."""
-        at = f"at {100 * self.at.shift:+.2g} %, damping x {self.at.damping:.3g}"
-        if self.peak == inf:
-            return f"unstable within the [robust] set, {at}"
-        peak = f"peak of S {self.peak:.4g} {at}"
-        if self.passed:
-            return f"the [robust] set is kept ({self.plants} plants, worst {peak})"
-        return f"the [robust] set is not kept: {peak}"
-
 
 @dataclass(frozen=True)
 class OtherDamping:

@@ -9,9 +9,10 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.run import within
 from ccd_casadi.codesign.structured_entries import design_dict, sections_controller
-from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
+from ccd_casadi.codesign.verdict import Check, State, deployable
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
@@ -176,9 +177,9 @@ def share_answer(found: ShareDesign) -> Answer:
         "reason": "" if good else words[0], "anchors": [design.kappa.tolist()],
         "robust": {"set": kept}, "seed": search.seed,
         "verdict": {
-            "certified": VerdictLine.of(
-                State.PASSED if design.certified else State.FAILED,
-                (f"{design.words}, on which it was designed",), {},
+            "certified": Check(
+                "certified", State.PASSED if design.certified else State.FAILED,
+                (Reason.DESIGNED_ON(words=design.words),), {},
             ).entry,
             "survives": line.entry,
             "deployable": deployable(None, problem.sampling).entry,
