@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import (
@@ -28,6 +27,7 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
 
 if TYPE_CHECKING:  # that states its controller by this module
+    from ccd_casadi.budget.sources import ErrorBudget
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 Scenario = tuple[int, tuple[float, ...]]
@@ -222,7 +222,7 @@ class StructuredProblem(ControllerProblem):
         others = (known for known in getattr(self, name) if known != kappa)
         return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
 
-    def identity_with(self, weights: Weights, budget: ErrorBudget | None) -> dict[str, Any]:
+    def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
         """Its own, ω_T that bounds KS and T, and what moves the stage where that counts."""
         found = {"sections": self.identity() | {"omega_T": weights.omega_T}}
         if self.figure is RMS_ERROR:
