@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_problem import structured_of
+from ccd_casadi.inner_problem.structured_problem import state_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -119,7 +119,7 @@ def second_on_set(
         return NOT_COMPARED
     from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 
-    uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
+    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
     points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
     pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
     of_GS, bounds = ("GS",) if problem.sampling is None else (), bounds_of(problem)

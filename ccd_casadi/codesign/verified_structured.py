@@ -32,7 +32,13 @@ from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import (
+    Scenario,
+    state_of,
+    structured_of,
+    with_state,
+    with_structured,
+)
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
@@ -56,12 +62,13 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
     """The climbs from a certified design with parameters κ (SI)."""
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
-    def climbed(**easier: object) -> float:
-        eased = with_structured(problem, minimise="bandwidth", **easier)
+    def climbed(easier: CoDesignProblem) -> float:
+        eased = with_structured(easier, minimise="bandwidth")
         value = structured_value(from_controller(eased, kappa.tolist()), theta)
         return value.bandwidth if value.feasible else float("nan")
 
-    return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))
+    alone = with_state(problem, scenarios=((0, model),))
+    return Costs(climbed(alone), climbed(with_structured(problem, sampling=None)))
 
 
 class Gap(Protocol):
@@ -170,7 +177,7 @@ class VerifiedStructured(Verified):
                 for optimum in self.optima
             ],
             "rounds": self.rounds,
-            "anchors": [list(kappa) for kappa in structured.warm_starts],
+            "anchors": [list(kappa) for kappa in structured.state.warm_starts],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
@@ -183,7 +190,7 @@ class VerifiedStructured(Verified):
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
                 f"{entry}_raced": None if self.multistart is None else self.multistart.value,
-                "error_anchors": [list(kappa) for kappa in structured.error_warm_starts],
+                "error_anchors": [list(kappa) for kappa in structured.state.error_warm_starts],
             }
         if structured.uncertainty.ranges:
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
@@ -198,7 +205,7 @@ class VerifiedStructured(Verified):
     def _robust_entry(self) -> dict[str, Any]:
         """The judge on a lattice of the box, and the worst plant that was searched."""
         stable = [plant for plant in self.wide.plants if plant.stable]
-        scenarios = structured_of(self.problem).scenarios
+        scenarios = state_of(self.problem).scenarios
         return {
             **robust_dict(self.wide, self.checked, self.worst),
             "stable": len(stable) == len(self.wide.plants),
@@ -214,7 +221,7 @@ class VerifiedStructured(Verified):
         if judged is None or not all(plant.stable for plant in judged.plants):
             return {}
         uncertain, low = uncertain_plant(self.problem, self.theta), bounds.omega_low / HZ
-        points = [(option, tuple(point)) for option, point in own.scenarios]
+        points = [(option, tuple(point)) for option, point in own.state.scenarios]
         points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
         shares = [bounds.shares(plant) for plant in judged.plants]
         found = {}

@@ -133,9 +133,9 @@ def _points(
     the set alone."""
     sections = structured_of(run.problem)
     if run.case.robust.share is not None:
-        return [(i, np.array(p)) for i, p in sections.scenarios]
-    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
-    return points + (lattice(uncertain, count, sections.seed) if dense else [])
+        return [(i, np.array(p)) for i, p in sections.state.scenarios]
+    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.state.scenarios)]
+    return points + (lattice(uncertain, count, sections.state.seed) if dense else [])
 
 
 def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:

@@ -21,7 +21,7 @@ from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.plants.plant import hardware_cost
@@ -102,7 +102,7 @@ def design_for_share(
 
     problem, whole, at = sampler.problem, None, theta or of.problem.start
     if theta is not None:
-        fixed = with_structured(replace(problem, start=theta), seed=seed)
+        fixed = with_state(replace(problem, start=theta), seed=seed)
         with within_budget(minutes):
             problem, made, _ = prepared(fixed, tell, sampler.workers)
         whole = made if made.certified else None
@@ -155,7 +155,7 @@ def share_answer(found: ShareDesign) -> Answer:
     else:
         words.append("whole box     no controller was found for it")
     kept = [{"option": option, "point": list(point)}
-            for option, point in structured_of(problem).scenarios]  # fmt: skip
+            for option, point in state_of(problem).scenarios]  # fmt: skip
     entry = {
         "status": "verified" if good else "not_verified",
         "verdict": {"share": line.entry},
