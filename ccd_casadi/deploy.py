@@ -141,9 +141,7 @@ def main(options: argparse.Namespace) -> ExitCode:
                 (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = with_verdict_line(
-        finished, folder, "deployable", deployed_line(finished, found, moved)
-    )
+    finished = with_verdict_line(finished, folder, deployed_line(finished, found, moved))
     inform(_summary(finished, found, moved))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words

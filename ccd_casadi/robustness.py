@@ -78,7 +78,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     own = options.controller is None
     if own:
-        finished = with_verdict_line(finished, folder, "survives", survival_line(finished, found))
+        finished = with_verdict_line(finished, folder, survival_line(finished, found))
     page = robustness_page(finished, found, options.seed, index_of(folder), own=own)
     publish(folder, folder / "robustness.html", page)
     inform(plain("\n".join(filter(None, (page.head.decision, *conclusion(finished, found))))))

@@ -3,6 +3,7 @@
 import fcntl
 import gc
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -74,19 +75,29 @@ def pictures(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def short_verdicts() -> Iterator[None]:
-    """Every line of a verdict that any test makes has 25 words at most, and none had to be cut."""
-    from ccd_casadi.codesign.verdict import VerdictLine
+    """Every line of a verdict that any test makes has 25 words at most, and none had to be cut; as
+    result.json has it, it renders to the same words but of what is not finite."""
+    from ccd_casadi.codesign.verdict import Check
+    from ccd_casadi.support.json_files import json_values
 
-    made = VerdictLine.__init__
+    made, reading = Check.__init__, False
 
-    def checked(self: VerdictLine, *args: Any, **named: Any) -> None:
+    def checked(self: Check, *args: Any, **named: Any) -> None:
+        nonlocal reading
         made(self, *args, **named)
+        if reading:
+            return
+        reading = True
+        again = Check.read(self.name, json_values(self.entry)).clauses
+        reading = False
+        finite = re.search(r"\b(inf|nan)\b", "; ".join(self.clauses)) is None
+        assert again == self.clauses or not finite, again
         long = [one for one in self.clauses if len(one.split()) > 25 or one.endswith(" ...")]
         assert not long, long
 
-    VerdictLine.__init__ = checked  # type: ignore[method-assign]
+    Check.__init__ = checked  # type: ignore[method-assign]
     yield
-    VerdictLine.__init__ = made  # type: ignore[method-assign]
+    Check.__init__ = made  # type: ignore[method-assign]
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ from ccd_casadi.budget.sources import (
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import Fail, several, short_repr
 from ccd_casadi.cases.tables import BudgetTable, Parameter, PlacesTable
+from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
 
 
@@ -67,6 +68,11 @@ def check_present(table: PlacesTable, theta: Sequence[Parameter], fail: Fail) ->
         if not values or not {0.0, 1.0}.issuperset(values):
             words = "may be other than 0 and 1, and no part of an actuator can be built"
             raise fail(f"theta.{name}", f"{words}; give values = [0, 1], or fixed")
+
+
+def names_of(table: PlacesTable) -> tuple[str, ...]:
+    """The parameters that its coordinates name."""
+    return names_in((*table.actuators, *table.sensors, table.present))
 
 
 def places_of(table: PlacesTable) -> Places | None:

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases import checks
-from ccd_casadi.cases.budget import check_directions, check_present, checked_budget, checked_places
 from ccd_casadi.cases.checks import CaseError, Fail, short_repr
 from ccd_casadi.cases.controller_kinds import check_kind, idle_keys
 from ccd_casadi.cases.controller_tables import ChannelTable, check_filters, check_motion
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
-from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
-from ccd_casadi.plants.nodes import names_in
+from ccd_casadi.cases.tables import REQUIRED, TABLES, BudgetTable, Case, PlacesTable
 from ccd_casadi.support.options import DEFAULT_CASE, one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
@@ -166,23 +164,27 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             words = f"is {above:g}, not above {low} = {below:g}; give {high} > {low}, so that {why}"
             raise fail(f"weights.{high}", words)
     check_kind(tables, fail)
-    tables["budget"] = checked_budget(tables["budget"], path.parent, fail)
-    tables["places"] = checked_places(tables["places"], path.parent, fail)
+    placed = tables["places"] != PlacesTable()
+    if placed or tables["budget"] != BudgetTable():  # few cases have these
+        from ccd_casadi.cases import budget
+
+        tables["budget"] = budget.checked_budget(tables["budget"], path.parent, fail)
+        tables["places"] = budget.checked_places(tables["places"], path.parent, fail)
     plant = plant_table(data["plant"], path, fail)
     own = dict(data["plant"])
     plants = tuple(_options_of(one, own, path, fail) for one in tables["robust"].plants)
     tables["robust"] = replace(tables["robust"], plants=plants)
     places, size = tables["places"], tables["motor"].size
-    named = names_in((*places.actuators, *places.sensors, places.present))
-    of_case = (*named, *filter(None, [size]))
+    of_case = (*(budget.names_of(places) if placed else ()), *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
             words = 'needs controller.structure = "sections"; choose that, or drop it'
             raise fail(f"theta.{parameter.name}.varies", words)
     several = bool(plants) or any(parameter.varies for parameter in fixed)
-    check_directions(places, several, fail)
-    check_present(places, (*theta, *fixed), fail)
+    if placed:
+        budget.check_directions(places, several, fail)
+        budget.check_present(places, (*theta, *fixed), fail)
     check_filters(tables, fail)
     check_motion(tables, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)

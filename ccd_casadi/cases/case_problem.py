@@ -6,11 +6,10 @@ from dataclasses import replace
 from secrets import token_hex
 from typing import Any
 
-from ccd_casadi.cases.budget import error_budget, places_of
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
 from ccd_casadi.cases.controller_tables import filters_of, motion_problem
-from ccd_casadi.cases.tables import Case, RobustTable
+from ccd_casadi.cases.tables import BudgetTable, Case, PlacesTable, RobustTable
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
     MixedSensitivityProblem,
@@ -79,6 +78,11 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     elif case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
+    positions = budget = None
+    if case.places != PlacesTable() or case.budget != BudgetTable():  # few cases have these
+        from ccd_casadi.cases.budget import error_budget, places_of
+
+        positions, budget = places_of(case.places), error_budget(case.budget)
     structured = case.controller.structure == "sections"
     problem = CoDesignProblem(
         source=PlantSource(
@@ -90,7 +94,7 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             content=None if given is None else token_hex(),
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
-            places=places_of(case.places),
+            places=positions,
             wiring=Wiring(filters_of(case.actuator), filters_of(case.sensor)),
             given=given,
         ).pinned(),
@@ -121,7 +125,7 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         controller=structured_problem(case, tuple(map(_options, case.robust.plants)))
         if structured
         else MixedSensitivityProblem(),
-        budget=error_budget(case.budget),
+        budget=budget,
         spoken=(case.units.output, case.units.input),
     )
     try:

@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from ccd_casadi.budget.sources import SourceKind
 from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
-from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
+from ccd_casadi.cases.tables import BudgetTable, Case, InnerTable, WeightsTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES, RMS_ERROR, Options
@@ -116,7 +115,7 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     if not structured:
         return
     inner, budget = tables["inner"], tables["budget"]
-    if v is RMS_ERROR and not any(getattr(budget, kind.value) for kind in SourceKind):
+    if v is RMS_ERROR and budget == BudgetTable():
         words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
         raise fail("inner.minimise", f"{words} or another")
     if inner.bandwidth_least_hz is not None and not of_error:

@@ -37,7 +37,9 @@ from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
+    state_of,
     structured_of,
+    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
@@ -314,7 +316,7 @@ def _read_structured(
     kappa = np.array(sections_kappa(folder, structure))
     controller = structure.state_space(kappa)
     problem = with_function(folder / "result.json", problem, result)
-    kept = [(option, np.array(point)) for option, point in structured_of(problem).scenarios]
+    kept = [(option, np.array(point)) for option, point in state_of(problem).scenarios]
     if of_share and not kept:
         words = "robust.set: is missing; run `ccd tolerances` again"
         raise UserError(f"{folder / 'result.json'}: {words}")
@@ -366,7 +368,7 @@ def with_function(
         if any(len(kappa) != own for kappa in (*warm_starts, *slower)):
             raise ValueError("of another structure")
     known = {"warm_starts": warm_starts, "error_warm_starts": slower}
-    return with_range(with_structured(problem, **known, scenarios=scenarios, seed=seed))
+    return with_range(with_state(problem, **known, scenarios=scenarios, seed=seed))
 
 
 def _with_directions(

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
-from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
 from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.plant_tables import KEYS as THETA
@@ -81,6 +80,8 @@ def toml(value: Any) -> str:
 
 def case_schema() -> dict[str, Any]:
     """The JSON Schema of a case file: the template, with the properties of every table added."""
+    from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS  # a solve needs none
+
     schema: dict[str, Any] = json.loads(package_text("templates/case.schema.json"))
     tables = schema["properties"]
     tables["plant"]["properties"]["model"]["enum"] = sorted({*model_names(), MEASURED})
@@ -107,6 +108,8 @@ def case_schema() -> dict[str, Any]:
 
 def keys_page() -> str:
     """Every key of a case file in tables, as Markdown."""
+    from ccd_casadi.cases.budget import TABLE_CHECKS
+
     required = ("lower", "upper")
     theta = ((key, "required" * (key in required), "", says) for key, (_, says) in THETA.items())
     tables = {**TABLES, "controller.channel.NAME": ChannelTable}

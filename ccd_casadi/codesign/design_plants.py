@@ -8,7 +8,6 @@ the plant alone the set is widened step by step, each design polished on the pro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from time import perf_counter
 from typing import cast
 
 import numpy as np
@@ -22,7 +21,6 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import named_values
-from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
@@ -69,17 +67,19 @@ def best_over_design_plants(
     outer_of: Callable[[Sampler], Outer],
     solve: Callable[[Outer], Solution],
     terms: RunTerms,
-) -> Solution:
-    """The best of a problem's solutions over its design plants, by `solve` and continuation.
+) -> tuple[Solution, float | None]:
+    """The best of a robust problem's solutions over its design plants, by `solve` and continuation.
 
-    A problem with one design plant, or none, is solved as it is.
+    A problem with one design plant is solved as it is. Returns the part of the set's range, too, up
+    to which designs were found where none holds on the whole.
     """
     problem = sampler.problem
+    assert problem.robust is not None
     choices = design_choices(problem)
     samplers = [sampler.of(choice) if len(choices) > 1 else sampler for choice in choices]
     found = [solve(outer_of(each)) for each in samplers]
     share = None
-    if problem.robust is not None and not any(map(_holds, found)) and not time_is_up():
+    if not any(map(_holds, found)) and not time_is_up():
         share = 0.0
         alone = solve(outer_of(sampler.of(replace(problem, robust=None), traced=False)))
         if alone.verified is not None:
@@ -92,18 +92,13 @@ def best_over_design_plants(
                     found[i] = min(found[i], there, key=order)
     violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
     best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
-    result = with_all_spent(found[best].result, sampler.spent.by_purpose)
-    result["seconds"] = perf_counter() - terms.began
-    if problem.robust is not None:
-        names = [choice.robust.design_at for choice in choices if choice.robust]
-        reported = [
-            {key: item.result[key] for key in REPORTED if key in item.result} for item in found
-        ]
-        tried = dict(zip(names, reported, strict=True))
-        result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
+    names = [choice.robust.design_at for choice in choices if choice.robust]
+    reported = [{key: item.result[key] for key in REPORTED if key in item.result} for item in found]
+    tried = dict(zip(names, reported, strict=True))
+    result = found[best].result
+    own = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
-    result["reason"] = outer_of(sampler).failure_reason(found[best], share)
-    return replace(found[best], result=result, problem=choices[best])
+    return replace(found[best], result={**result, "robust": own}, problem=choices[best]), share
 
 
 def _holds(item: Solution) -> bool:
@@ -126,8 +121,6 @@ def order(item: Solution) -> tuple[int, int, float]:
 def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Why a search failed: where it looked, how near it came, what may be tried."""
     problem, words = sampler.problem, str(best.result["reason"])
-    if best.result["status"] == "verified":
-        return words
     if best.verified is not None:
         figures = cast(VerifiedDesign, best.verified).design.figures
         missed = " and ".join(missed_bounds(problem.inner, figures))

@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_problem import structured_of
+from ccd_casadi.inner_problem.structured_problem import state_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -119,7 +119,7 @@ def second_on_set(
         return NOT_COMPARED
     from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 
-    uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
+    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
     points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
     pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
     of_GS, bounds = ("GS",) if problem.sampling is None else (), bounds_of(problem)
@@ -163,17 +163,6 @@ class RobustCheck:
     at: Perturbation
     plants: int
     passed: bool
-
-    @property
-    def words(self) -> str:
-        """Whether the set is kept, and where it is worst."""
-        at = f"at {100 * self.at.shift:+.2g} %, damping x {self.at.damping:.3g}"
-        if self.peak == inf:
-            return f"unstable within the [robust] set, {at}"
-        peak = f"peak of S {self.peak:.4g} {at}"
-        if self.passed:
-            return f"the [robust] set is kept ({self.plants} plants, worst {peak})"
-        return f"the [robust] set is not kept: {peak}"
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import with_structured
+from ccd_casadi.inner_problem.structured_problem import with_state
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -198,10 +198,10 @@ def structured_answer(
         raise UserError(words)
     begin_at, tell, workers = options.begin_at, options.tell, options.workers
     head = head_of(problem, theta)
-    required = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
+    required = replace(with_range(with_state(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
         kappa = sections_kappa(begin_at, structure_of(required))
-        required = with_structured(required, warm_starts=(kappa,))
+        required = with_state(required, warm_starts=(kappa,))
     required, made, worst = prepared(required, tell, workers, begin_at is not None)
     fastest = made.bandwidth
     required, made, least = least_from(required, theta, made, tell, workers)

@@ -146,7 +146,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         self.curved_plants, self.ends_early, self.options = curved_plants, ends_early, options
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
         structured = structured_of(problem)
-        known = [(option, np.array(point)) for option, point in structured.scenarios]
+        known = [(option, np.array(point)) for option, point in structured.state.scenarios]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
         middle = (self.middle - lower) / self.width

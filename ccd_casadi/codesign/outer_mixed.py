@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.final_judgement import (
     check_references,
     other_damping,
@@ -121,6 +120,10 @@ class MixedOuter(Outer):
         return None
 
     def failure_reason(self, solution: Solution, share: float | None) -> str:
+        if solution.result["status"] == "verified":
+            return str(solution.result["reason"])
+        from ccd_casadi.codesign.design_plants import failure_words  # where a search failed
+
         return failure_words(self.sampler, solution, share)
 
     def verified(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:

@@ -40,7 +40,7 @@ from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of
+from ccd_casadi.inner_problem.structured_problem import Scenario, state_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.plants.plant import hardware_cost
@@ -113,12 +113,12 @@ class StructuredOuter(ThetaOuter):
     def prepared(self, seed: int) -> "StructuredOuter":
         """Searched at the start for warm starts and the plant set, where there are none."""
         sampler = self.sampler
-        if structured_of(sampler.problem).warm_starts:
+        if state_of(sampler.problem).warm_starts:
             return self
         with stage(StageOptions.start):
             problem, words = with_initial_search(sampler, seed)
         sampler.count_multistart(sampler.hash)
-        lost = words and not structured_of(problem).warm_starts
+        lost = words and not state_of(problem).warm_starts
         return StructuredOuter(sampler.of(problem), words if lost else "")
 
     def resumed(self, folder: Path, seed: int) -> "StructuredOuter":

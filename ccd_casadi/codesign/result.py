@@ -19,17 +19,10 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.requirements import requirements
 from ccd_casadi.codesign.result_entries import budget_entry, iso_entry, move_entry
-from ccd_casadi.codesign.verdict import (
-    State,
-    VerdictLine,
-    clauses_of,
-    confirmed,
-    deployable,
-    optimal,
-    predicted,
-)
+from ccd_casadi.codesign.verdict import Check, State, confirmed, deployable, optimal, predicted
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import notes_of
 from ccd_casadi.sampling.inner_samples import spent_entry
@@ -63,17 +56,17 @@ def result_dict(
     error = abs(promised / verified.value - 1.0)
     optimality = partial(
         optimal, verified.kkt, level=verified.kkt_level, saddle=verified.saddle,
-        tolerance=tolerance, better=verified.gap_words(), unknown=verified.no_gradient_words(),
+        tolerance=tolerance, better=verified.better(), unknown=verified.no_gradient(),
         searched=verified.searched(outcome, global_check),
     )  # fmt: skip
     judged = quality[0] if quality else None
-    verdict = {  # in the order in which they matter
-        "certified": confirmed(verified.certified_line(), verified.second),
-        "optimal": optimality(gap=verified.inner_gap),
-        "predicted": predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
-        "survives": verified.survives_line(),
-        "deployable": deployable(verified.survival, problem.sampling),
-    }
+    verdict = (  # in the order in which they matter
+        confirmed(verified.certified_line(), verified.second),
+        optimality(gap=verified.inner_gap),
+        predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
+        verified.survives_line(),
+        deployable(verified.survival, problem.sampling),
+    )
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
     checks: dict[str, bool | None] = {  # None: it could not be made, or there is nothing to check
@@ -87,8 +80,8 @@ def result_dict(
         **verified.checks(),
     }
     failed = [name for name, passed in checks.items() if passed is False]
-    lost = [f"{name}: {line.words}" for name, line in verdict.items() if line.state is State.FAILED]
-    failed = failed or [name for name, line in verdict.items() if line.state is State.FAILED]
+    lost = [f"{line.name}: {line.words}" for line in verdict if line.state is State.FAILED]
+    failed = failed or [line.name for line in verdict if line.state is State.FAILED]
     why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
     figures = verified.figures()
@@ -96,7 +89,7 @@ def result_dict(
         **figures,
         "status": "not_verified" if failed else "verified",
         "reason": words,
-        "verdict": {name: line.entry for name, line in verdict.items()},
+        "verdict": {line.name: line.entry for line in verdict},
         "formulation": terms.formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
@@ -152,12 +145,13 @@ def of_budget(
         With `time_budget` and `phase_seconds` in its result.
     """
     own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
-    result, words = {**solution.result, **own}, "; ".join(spent.clauses)
+    result = {**solution.result, **own}
+    ended = (Reason.BUDGET(**spent.entry), Reason.LARGER_BUDGET()) if spent.ended else ()
+    words = "; ".join(one.words() for one in ended)
     if words and "verdict" in result:
-        line = result["verdict"]["optimal"]
-        figures = {key: v for key, v in line.items() if key not in ("state", "words", "details")}
-        own_line = VerdictLine.of(State.UNKNOWN, (*spent.clauses, *clauses_of(line)), figures)
-        verdict = result["verdict"] = {**result["verdict"], "optimal": own_line.entry}
+        line = Check.read("optimal", result["verdict"]["optimal"])
+        line = replace(line, state=State.UNKNOWN, findings=(*ended, *line.findings))
+        verdict = result["verdict"] = {**result["verdict"], "optimal": line.entry}
         unknown = dict.fromkeys(("inner_optimum", "optimality"))
         checks = result["checks"] = {**result["checks"], **unknown}
         lost = any(one["state"] == State.FAILED.value for one in verdict.values())
@@ -221,7 +215,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def with_verdict_line(run: "FinishedRun", out: Path, name: str, line: VerdictLine) -> "FinishedRun":
+def with_verdict_line(run: "FinishedRun", out: Path, line: Check) -> "FinishedRun":
     """Replace a line of a run's verdict, and write it if `out` is within the run's folder.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
@@ -233,7 +227,7 @@ def with_verdict_line(run: "FinishedRun", out: Path, name: str, line: VerdictLin
         The run.
     out : Path
         Where the command writes.
-    name, line : str, VerdictLine
+    line : Check
         Of the verdict.
 
     Returns
@@ -243,11 +237,11 @@ def with_verdict_line(run: "FinishedRun", out: Path, name: str, line: VerdictLin
     """
     from ccd_casadi.cases.run_folder import read_json
 
-    folder, before = run.folder.resolve(), at_solve(run.result, name)
+    folder, before = run.folder.resolve(), at_solve(run.result, line.name)
     if not before or not out.resolve().is_relative_to(folder):
         return run
     result = dict(read_json(folder / "result.json"))
-    result["verdict"] = {**result["verdict"], name: line.entry | {"at_solve": before}}
+    result["verdict"] = {**result["verdict"], line.name: line.entry | {"at_solve": before}}
     write_json(folder / "result.json", result)
     return replace(run, result=result)
 

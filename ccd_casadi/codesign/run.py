@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter
 
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.controller_tables import OuterTable
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.formulations import (
     Formulation,
@@ -26,6 +26,7 @@ from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Mixed
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.kernels.compilation import ensure_compiled
+from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -196,7 +197,17 @@ def co_design(
             found, solution = again, conclude(again, terms)
         return solution
 
-    return best_over_design_plants(sampler, outer_of, solved, terms)
+    if sampler.problem.robust is None:
+        best, share = solved(outer_of(sampler)), None
+        best = replace(best, problem=sampler.problem)
+    else:  # made on one of several plants
+        from ccd_casadi.codesign.design_plants import best_over_design_plants
+
+        best, share = best_over_design_plants(sampler, outer_of, solved, terms)
+    result = with_all_spent(best.result, sampler.spent.by_purpose)
+    result["seconds"] = perf_counter() - terms.began
+    result["reason"] = outer_of(sampler).failure_reason(best, share)
+    return replace(best, result=result)
 
 
 def outer_of(sampler: Sampler) -> Outer:

@@ -15,7 +15,7 @@ from ccd_casadi.inner_problem.structured_bandwidth import (
     structured_value,
 )
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
     prepared,
@@ -48,14 +48,14 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
 
     Second, in words, why there are no warm starts; empty where there are.
     """
-    problem = with_range(with_structured(sampler.problem, seed=seed))
+    problem = with_range(with_state(sampler.problem, seed=seed))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def searched() -> InitialSearch:
         tell = printer("search at the start", sampler.quiet)
         anchored, made, _ = prepared(problem, tell, sampler.workers)
         anchored, made, _ = least_from(anchored, problem.start, made, tell, sampler.workers)
-        own, start = structured_of(anchored), problem.start
+        own, start = state_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
@@ -71,7 +71,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
     found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
     sampler.bandwidth_at_start = found.bandwidth
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
-    return with_structured(problem, **known, scenarios=found.members), found.words
+    return with_state(problem, **known, scenarios=found.members), found.words
 
 
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:

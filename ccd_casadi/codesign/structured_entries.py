@@ -8,6 +8,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import compliance_of, loop_entry
 from ccd_casadi.analysis.yield_bound import Yield
+from ccd_casadi.codesign.reasons import Finding, Reason, within_words
 from ccd_casadi.codesign.result_entries import compliance_dict, controller_dict
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure.bounds import BINDS, Bounds, BrokenAt, key_words, kind_and_channel
@@ -165,22 +166,16 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
     return {"channel_bounds": found} if found else {}
 
 
-def kept_words(worst: Excess) -> str:
-    """Which bounds hold on a box whose judge is loose, by its worst plant to six digits."""
-    if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
-        return "within every bound"
-    return f"no bound exceeded by more than {100.0 * BoxCheckOptions.looseness:g} %"
-
-
 def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
     """`robust`: the judge on so many plants of the box, and the worst that was searched."""
-    words = f"stable, {kept_words(worst)} on {counted(plants, 'plant')}"
+    excess = float(np.expm1(worst.value))
+    within = within_words(excess, BoxCheckOptions.looseness)
     return {
         "plants": plants,
         "passed": wide.passed,
-        "words": words if wide.passed else wide.words,
+        "words": f"stable, {within} on {counted(plants, 'plant')}" if wide.passed else wide.words,
         "bandwidth_hz": wide.bandwidth / HZ,
-        "worst_excess": float(np.expm1(worst.value)),
+        "worst_excess": excess,
     }
 
 
@@ -248,14 +243,7 @@ def sections_controller(design: WithSections, sampling: Sampling | None) -> dict
     return controller_dict(design.controller) | {"sections": words}
 
 
-PROVEN = {
-    OwnSet.KEPT: "proven",
-    OwnSet.UNPROVEN: "not every bound is proven",
-    OwnSet.SEARCHED: "searched, not proven",
-}
-
-
-def box_words(
+def box_findings(
     wide: SetCertificate, checked: int, proof: "Proof", worst: Excess, drawn: Yield | None,
     *, along: bool,
 ) -> dict[str, Any]:  # fmt: skip
@@ -277,34 +265,34 @@ def box_words(
     Returns
     -------
     dict
-        `own`, `own_words` and `figures`.
+        `own`, `own_findings` and `figures`.
     """
-    excess, fresh = math.expm1(worst.value), () if drawn is None else (drawn.words,)
+    excess = math.expm1(worst.value)
     figures = {
         "plants": checked,
         "worst_excess": excess,
         "proof": proof.outcome.name.lower(),
         "proven": proof.levels,
         "unproven": proof.unasked,
+        "looseness": BoxCheckOptions.looseness,
     }
-    tried = f"{counted(checked, 'plant')} of the [robust] set"
-    found = f"worst plant that a search found: {100.0 + 100.0 * excess:.6g} % of a bound"
-    within = kept_words(worst)
+    fresh = () if drawn is None else (Reason.DRAWN(words=drawn.words, **drawn.entry),)
+    proven = tuple(Reason.PROOF(words=words) for words in proof.clauses)
+    worst_found = Reason.WORST_FOUND(percent=100.0 + 100.0 * excess)
     own = OwnSet.BROKEN
-    clauses: tuple[str, ...] = (f"{within} on {tried}", found)
+    found: tuple[Finding, ...] = (Reason.TRIED_WITHIN(), worst_found)
     if not wide.passed:
-        clauses = (wide.words, f"on {tried}")
+        found = (Reason.JUDGED(words=wide.words), Reason.ON_PLANTS())
     elif proof.denies:
-        clauses = (*proof.clauses, *clauses)
+        found = (*proven, *found)
     elif checked <= 1:
-        own, clauses = OwnSet.NONE, ("judged on the model alone: [robust] names no plant",)
+        own, found = OwnSet.NONE, (Reason.MODEL_ALONE(),)
     elif drawn is not None and drawn.survived < drawn.draws:
-        clauses = (*fresh, *clauses)
+        found = (*fresh, *found)
     elif along:
         own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
         own = OwnSet.UNPROVEN if proof.unclosed else own
-        clauses = (f"{within} on the [robust] set: {PROVEN[own]}", *proof.clauses,
-                   f"judged on {tried}", found, *fresh)  # fmt: skip
+        found = (Reason.SET_WITHIN(), *proven, Reason.JUDGED_ON(), worst_found, *fresh)
     else:
-        clauses = ("the [robust] set is not kept all along its common resonance shift", *clauses)
-    return {"own": own, "own_words": clauses, "figures": figures}
+        found = (Reason.NOT_ALONG(), *found)
+    return {"own": own, "own_findings": found, "figures": figures}

@@ -37,7 +37,12 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     warm_starts_at,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import (
+    Scenario,
+    state_of,
+    structured_of,
+    with_state,
+)
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -67,7 +72,7 @@ class ListedStructured:
             return _nothing(forbidden)
         found = self._anew(sampler) if near is None else self._near(sampler, near)
         if found.problem is not None:
-            self.scenarios = structured_of(found.problem).scenarios
+            self.scenarios = state_of(found.problem).scenarios
         return found
 
     def _anew(self, sampler: Sampler) -> Solution:
@@ -93,7 +98,7 @@ class ListedStructured:
         started = carried(near, replace(sampler.problem, start=near.start), self.scenarios)
         whole = self.solve(sampler.of(started), np.array(near.start))
         if whole.verified is not None:
-            self.scenarios = structured_of(whole.verified.problem).scenarios
+            self.scenarios = state_of(whole.verified.problem).scenarios
         return whole
 
 
@@ -128,15 +133,15 @@ def carried(
     near: CoDesignProblem, problem: CoDesignProblem, scenarios: tuple[Scenario, ...]
 ) -> CoDesignProblem:
     """A problem with the warm starts of one like it, moved from that one's start to its own."""
-    problem = with_structured(problem, seed=structured_of(near).seed, scenarios=scenarios)
+    problem = with_state(problem, seed=state_of(near).seed, scenarios=scenarios)
     problem = with_range(problem)
     plants, bounds = plants_of(problem, problem.start), bounds_of(problem)
     moved = {}
     for name in ("warm_starts", "error_warm_starts"):
-        of = with_structured(near, warm_starts=getattr(structured_of(near), name))
+        of = with_state(near, warm_starts=getattr(state_of(near), name))
         kappas = warm_starts_at(of, structure_of(problem), plants, bounds)
         moved[name] = tuple(tuple(map(float, kappa)) for kappa in kappas)
-    return with_structured(problem, **moved)
+    return with_state(problem, **moved)
 
 
 def _start(solution: Solution) -> CoDesignProblem:
@@ -151,7 +156,7 @@ def _start(solution: Solution) -> CoDesignProblem:
 def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
-    alone = with_structured(problem, warm_starts=(kappa,), error_warm_starts=())
+    alone = with_state(problem, warm_starts=(kappa,), error_warm_starts=())
     own = structured_of(alone).with_warm_start(kappa, 1)
     return replace(alone, controller=own, start=theta)
 

@@ -8,6 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 import scipy
 
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, design_loops, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop, Sampling, tustin
@@ -213,7 +214,7 @@ class Survival:
     modulus: float
     unstable_poles_hz: tuple[float, ...]
     statics: Statics
-    contradiction: str = ""
+    contradiction: Finding | None = None
     S_max_slack: float = PEAK  # relative: by what ‖S‖∞ may exceed S_max within `S_max_shift`
 
     def within(self, low: float, high: float) -> bool:
@@ -409,9 +410,9 @@ def survival(
     """
     nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
     own = replace(loops.ported or nominal, controller=loops.controller)
-    denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
+    denied = None if nominal.stable else Reason.MODEL_UNSTABLE()
     if nominal.stable and not nominal.peak <= level:
-        denied = f"a second engine finds a peak of S of {nominal.peak:.6g} on the model itself"
+        denied = Reason.MODEL_PEAK(peak=nominal.peak)
     within, exceeded = range_within(
         loops, partial(shift_range, loops, marks=marks), S_max, slack, held
     )

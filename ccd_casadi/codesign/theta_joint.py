@@ -28,7 +28,7 @@ from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby
-from ccd_casadi.inner_problem.structured_problem import structured_of
+from ccd_casadi.inner_problem.structured_problem import state_of
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
@@ -275,8 +275,8 @@ def joint_search(
         state = replace(state, plants=Around.of(problem, state.point))
     if not (settled or ends is not None or time_is_up()):
         state, _ = with_last_steps(state, options.final_seed, report, options)
-    counted = structured_of(state.problem).scenarios
-    worse = set(counted) - set(structured_of(problem).scenarios)
+    counted = state_of(state.problem).scenarios
+    worse = set(counted) - set(state_of(problem).scenarios)
     if state.point.theta == first.theta and not worse:
         return JointEnd(sampler, first, settled)
     true = state.working.sampler.value_from(state.point.theta, state.point.kappa)

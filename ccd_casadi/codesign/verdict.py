@@ -10,17 +10,18 @@ checked is unknown and never passed.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Any, Self
 
 from ccd_casadi.codesign.formulation import GlobalCheck
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.optim.kkt import Kink, KktCertificate, KktOptions
-from ccd_casadi.support.text import counted, inwards, small_share, spoken, with_unit
+from ccd_casadi.optim.kkt import KktCertificate, KktOptions
 from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
 
@@ -89,60 +90,95 @@ class OwnSet(StrEnum):
 
 
 @dataclass(frozen=True)
-class VerdictLine:
+class Check:
     """One line of the verdict.
 
     Attributes
     ----------
+    name : str
+        Its key in result.json.
     state : State
         Passed, warned, failed or unknown.
-    words : str
-        Why, in one sentence of at most `most_words`.
+    findings : tuple of Finding
+        Why, the most important first.
     figures : mapping
         On which it rests, by keys of result.json.
-    details : tuple of str
-        What else is known, a clause each.
     """
 
+    name: str
     state: State
-    words: str
+    findings: tuple[Finding, ...]
     figures: Mapping[str, Any]
-    details: tuple[str, ...] = ()
 
-    @classmethod
-    def of(cls, state: State, clauses: Iterable[str], figures: Mapping[str, Any]) -> Self:
-        """A line of clauses in the order of their importance (`split`)."""
-        words, details = split(clauses)
-        return cls(state, words, figures, details)
+    @property
+    def reason(self) -> Reason:
+        """The most important one."""
+        return self.findings[0].reason
 
     @property
     def clauses(self) -> tuple[str, ...]:
-        """The sentence and the details."""
-        return (self.words, *self.details)
+        """The words of all findings."""
+        return tuple(one.words(self.figures) for one in self.findings)
+
+    @property
+    def words(self) -> str:
+        """Why, in one sentence of at most `most_words`."""
+        return split(self.clauses)[0]
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """What else is known, a clause each."""
+        return split(self.clauses)[1]
 
     @property
     def entry(self) -> dict[str, Any]:
         """Of `verdict` in result.json."""
-        said = {"words": self.words, "details": list(self.details)}
-        return {"state": self.state.value, **said, **self.figures}
+        words, details = split(self.clauses)
+        return {
+            "state": self.state.value, "reason": self.reason.key, "words": words,
+            "details": list(details), **self.figures,
+            "findings": [one.entry for one in self.findings],
+        }  # fmt: skip
+
+    @classmethod
+    def read(cls, name: str, entry: Mapping[str, Any]) -> Self:
+        """Read a line of result.json; one of an earlier version has words alone.
+
+        Parameters
+        ----------
+        name, entry : str, mapping
+            Of the line; the entry may be empty.
+
+        Returns
+        -------
+        Check
+        """
+        own = ("state", "reason", "words", "details", "findings", "at_solve")
+        figures = {key: value for key, value in entry.items() if key not in own}
+        found = tuple(
+            Reason[str(one["reason"]).upper()](**{k: v for k, v in one.items() if k != "reason"})
+            for one in entry.get("findings", ())
+        )
+        quoted = (Reason.QUOTED(words=words) for words in clauses_of(entry) if words)
+        state = State(entry.get("state", State.UNKNOWN))
+        return cls(name, state, found or tuple(quoted), figures)
 
 
 def split(
-    clauses: Iterable[str], options: VerdictOptions = VerdictOptions()
+    clauses: Sequence[str], options: VerdictOptions = VerdictOptions()
 ) -> tuple[str, tuple[str, ...]]:
-    """As many clauses as `most_words` hold as a sentence, and the others. Empty ones are left out;
-    a first one that is longer is cut, and whole among the others."""
-    given = [clause for clause in clauses if clause]
+    """As many clauses as `most_words` hold as a sentence, and the others; a first one that is
+    longer is cut, and whole among the others."""
     held, count = 0, 0
-    for clause in given:
+    for clause in clauses:
         held += len(clause.split())
         if held > options.most_words:
             break
         count += 1
-    words = "; ".join(given[:count])
-    if given and not count:
-        words = f"{' '.join(given[0].split()[: options.most_words - 1])} ..."
-    return words, tuple(given[count:])
+    words = "; ".join(clauses[:count])
+    if clauses and not count:
+        words = f"{' '.join(clauses[0].split()[: options.most_words - 1])} ..."
+    return words, tuple(clauses[count:])
 
 
 def clauses_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
@@ -161,14 +197,16 @@ def clauses_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
     return (str(entry.get("words", "")), *map(str, entry.get("details", ())))
 
 
-def confirmed(line: VerdictLine, second: EngineComparison) -> VerdictLine:
+def confirmed(line: Check, second: EngineComparison) -> Check:
     """`certified` with what a second engine says of the same loops."""
-    state, clauses = line.state, (*line.clauses, second.words)
+    state, found = line.state, (*line.findings, Reason.ENGINE_AGREES(loops=second.loops))
     if second.agrees is False:
-        state, clauses = State.FAILED, (second.words, *line.clauses)
+        state, found = State.FAILED, (Reason.ENGINE_DENIES(words=second.words), *line.findings)
     elif second.agrees is None and state is State.PASSED:
-        state, clauses = State.WARNED, (f"not confirmed: {second.words}", *line.clauses)
-    return VerdictLine.of(state, clauses, {**line.figures, "second_engine": second.entry})
+        state, found = State.WARNED, (Reason.NOT_CONFIRMED(words=second.words), *line.findings)
+    elif second.agrees is None:
+        found = (*line.findings, Reason.ENGINE_UNKNOWN(words=second.words))
+    return Check(line.name, state, found, {**line.figures, "second_engine": second.entry})
 
 
 def optimal(
@@ -177,137 +215,104 @@ def optimal(
     level: float,
     gap: float,
     tolerance: float,
-    better: str,
-    searched: tuple[Sequence[str], Mapping[str, Any]],
-    unknown: str = "",
+    better: Finding,
+    searched: tuple[Sequence[Finding], Mapping[str, Any]],
+    unknown: Finding | None = None,
     saddle: float | None = None,
     options: VerdictOptions = VerdictOptions(),
-) -> VerdictLine:
+) -> Check:
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
-    `searched`: where something better was searched for, in words and figures; `unknown`: why there
-    may be no gradient, in words. A `gap` of NaN: nothing was found to set against the design.
+    `searched`: where something better was searched for; `unknown`: why there may be no gradient. A
+    `gap` of NaN: nothing was found to set against the design.
     """
     saddle = options.saddle if saddle is None else saddle
     residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
     figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
+    line = partial(Check, "optimal", figures=figures)
     if gap > tolerance:
-        return VerdictLine.of(State.FAILED, (f"not optimal: {better}", *known), figures)
+        return line(State.FAILED, (better, *known))
     if not kkt.primal <= options.primal:
-        words = f"not optimal: a constraint or bound of theta is exceeded by {kkt.primal:.2g}"
-        return VerdictLine.of(State.FAILED, (words, *known), figures | {"primal": kkt.primal})
+        figures["primal"] = kkt.primal
+        return line(State.FAILED, (Reason.BOUND_EXCEEDED(), *known))
+    sound = State.PASSED
     if not math.isfinite(gap):
-        known = ("the search at this theta that was to challenge it found nothing", *known)
-    sound = State.PASSED if math.isfinite(gap) else State.WARNED
-    if unknown and not math.isfinite(residual):
-        words = f"{unknown}: a limit of the program"
-        return VerdictLine.of(State.WARNED, (words, *known), figures)
+        sound, known = State.WARNED, (Reason.NOT_CHALLENGED(), *known)
+    if unknown is not None and not math.isfinite(residual):
+        return line(State.WARNED, (unknown, *known))
     if not residual <= level:
-        words = f"not optimal: KKT residual {residual:.3g} over theta, above {level:g}"
-        return VerdictLine.of(State.FAILED, (words, *known), figures)
+        return line(State.FAILED, (Reason.NOT_STATIONARY(), *known))
     if kink is None:
-        stationary = f"KKT residual {residual:.2g} over theta"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
-            words = f"a stationary point, but J curves downwards there ({kkt.second_order:.2g})"
-            return VerdictLine.of(State.WARNED, (words, *known, stationary), figures)
-        best = f"locally optimal: {known[0]}"
-        return VerdictLine.of(sound, (best, *known[1:], stationary), figures)
+            return line(State.WARNED, (Reason.SADDLE(), *known, Reason.STATIONARY()))
+        best = Reason.LOCALLY_OPTIMAL(evidence=known[0].reason.key, **known[0].figures)
+        return line(sound, (best, *known[1:], Reason.STATIONARY()))
     figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
+    figures["least_slope"] = kink.least_slope
+    finite = [math.isfinite(slope) for pair in kink.slopes for slope in pair]
+    least = [Reason.LEAST_SLOPE()] if any(finite) else []
     if kink.least_slope < -level:
-        words = "not optimal: J has a kink and falls on a side of it"
-        return VerdictLine.of(State.FAILED, (words, *_sides(kink)[1:], *known), figures)
-    beside, *rest = _sides(kink)
+        return line(State.FAILED, (Reason.KINK_FALLS(), *least, *known))
     if kink.first_order and kink.slopes:
-        rest.append(f"by climbs of its controller, {KktOptions.step:g} of the box away")
-    rest.append(
-        f"KKT residual {residual:.2g} over theta and the controller together "
-        f"({kink.one_gradient:.2g} by the gradient of one side)"
-    )
-    known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
-    clauses = (f"locally optimal to first order at a kink: J {beside}", *known, *rest)
-    return VerdictLine.of(sound if known_all else State.WARNED, clauses, figures)
-
-
-def _sides(kink: Kink) -> list[str]:
-    """What values beside a kink say, and by how much."""
-    if not kink.slopes:
-        return ["was not evaluated beside it: bounds alone hold theta"]
-    found = [slope for pair in kink.slopes for slope in pair]
-    known = sum(map(math.isfinite, found))
-    if not known:
-        return ["is not known beside it"]
-    where = "both sides" if known == len(found) else f"the {known} known sides of {len(found)}"
-    of = f" of {counted(len(kink.slopes), 'direction')}" if len(kink.slopes) > 1 else ""
-    least = f"the least slope there is {kink.least_slope:.2g} of the gradient"
-    rises = "rises" if kink.least_slope > 0.0 else "rises or stays"
-    return [f"{rises} on {where}{of}", least]
+        least.append(Reason.CLIMBED(step=KktOptions.step))
+    clauses = (Reason.OPTIMAL_AT_KINK(), *known, *least, Reason.STATIONARY_AT_KINK())
+    return line(sound if all(finite) else State.WARNED, clauses)
 
 
 def search_evidence(
-    starts: int, optima: int, global_check: GlobalCheck | None, gap: str = "gap not known"
-) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """What IPOPT's starts, the global check over the box and bounds say, in clauses and figures."""
+    starts: int, optima: int, global_check: GlobalCheck | None, gap: Finding | None = None
+) -> tuple[tuple[Finding, ...], dict[str, Any]]:
+    """What IPOPT's starts, the global check over the box and bounds say, and its figures."""
+    gap = Reason.GAP_UNKNOWN() if gap is None else gap
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
-    known = f"best of {counted(starts, 'start')}" if starts else "from one start"
-    if optima > 1:
-        known += f", {optima} distinct optima"
     if global_check is None or not global_check.points:
-        return (f"{known}, no global check over the box", gap), figures
+        return (Reason.NO_GLOBAL_CHECK(), gap), figures
     counted_up = ("points", "fresh", "feasible", "better", "starts", "seed")
     figures |= {f"box_{name}": getattr(global_check, name) for name in counted_up}
     figures["objective_before"] = global_check.before
-    own = global_check.points - global_check.fresh
-    how = " and ".join(
-        [f"{global_check.fresh} other theta of the box"] * bool(global_check.fresh or not own)
-        + [f"{own} of the run"] * bool(own)
-    )
     if global_check.moved:
-        moved = f"moved by the global check: the formulation ended at J = {global_check.before:.6g}"
-        return (known, moved, f"checked at {how}", gap), figures
-    return (f"{known}, none better at {how}", gap), figures
+        return (Reason.STARTED(), Reason.MOVED(), Reason.CHECKED(), gap), figures
+    return (Reason.NONE_BETTER(), gap), figures
 
 
 def predicted(
     error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None,
     learnt: bool = False, options: VerdictOptions = VerdictOptions(),
-) -> VerdictLine:  # fmt: skip
+) -> Check:  # fmt: skip
     """Surrogate against truth at the design, whose `value` of a figure `of` merit is in SI.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` (relative)
     shows nothing: its `quality` (None: no surrogate) has the error there without it. `learnt`: the
     surrogate had `error` there, and has the design among its samples since.
     """
-    what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
+    line = partial(Check, "predicted", figures=figures)
     if quality is None:
-        words = "nothing was predicted: the search used true values"
-        return VerdictLine.of(State.UNKNOWN, (f"not applicable: {words}",), figures)
+        return line(State.UNKNOWN, (Reason.NOT_PREDICTED(),))
     left_out = quality.at_point
     if left_out is not None:
         size, sigmas = abs(left_out[0]), left_out[1]
         share = size / (of.factor * value)
-        figures |= {"left_out": share, f"left_out_{unit.lower()}": size, "left_out_sigmas": sigmas}
+        figures |= {
+            "left_out": share, f"left_out_{of.unit.lower()}": size, "left_out_sigmas": sigmas
+        }  # fmt: skip
     if not error <= tolerance:
-        words = (
-            f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
-        )
         if learnt and math.isfinite(error):
-            learnt_words = "the surrogate has learnt the design since"
-            return VerdictLine.of(State.WARNED, (words, learnt_words), figures | {"learnt": True})
-        return VerdictLine.of(State.FAILED, (words,), figures)
+            figures["learnt"] = True
+            return line(State.WARNED, (Reason.MISPREDICTED(), Reason.LEARNT()))
+        return line(State.FAILED, (Reason.MISPREDICTED(),))
     if left_out is None:
-        words = f"{what} predicted, error {small_share(error)}"
+        found = Reason.PREDICTED(what=of.words)
         if quality.extrapolates:
-            beyond = f"the surrogate extrapolates there: {quality.extrapolates[0]}"
-            return VerdictLine.of(State.WARNED, (words, beyond), figures)
-        return VerdictLine.of(State.PASSED, (words,), figures)
-    missed = f"{size:.2g} {unit} ({100 * share:.2g} %, {sigmas:.1f} sigma)"
-    words = f"the surrogate without this design misses its {what} by {missed}"
-    computed = f"the {what} itself is computed, not predicted"
-    if share <= tolerance or (sigmas <= options.sigmas and share <= options.left_out):
-        return VerdictLine.of(State.PASSED, (words, computed), figures)
-    return VerdictLine.of(State.WARNED, (f"{words}: do not use it here", computed), figures)
+            return line(State.WARNED, (found, Reason.EXTRAPOLATES(outside=quality.extrapolates[0])))
+        return line(State.PASSED, (found,))
+    good = share <= tolerance or (sigmas <= options.sigmas and share <= options.left_out)
+    state, why = (
+        (State.PASSED, Reason.LEFT_OUT) if good else (State.WARNED, Reason.LEFT_OUT_TOO_FAR)
+    )
+    missed = why(what=of.words, size=size, unit=of.unit)
+    return line(state, (missed, Reason.COMPUTED(what=of.words)))
 
 
 def survives(
@@ -315,12 +320,12 @@ def survives(
     *,
     S_max: float,
     own: OwnSet | None = None,
-    own_words: Sequence[str] = (),
+    own_findings: Sequence[Finding] = (),
     other_damping: str = "",
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
     options: VerdictOptions = VerdictOptions(),
-) -> VerdictLine:
+) -> Check:
     """The line `survives`: a loop on plants off its model. A figure that is NaN meets no limit.
 
     Parameters
@@ -329,9 +334,8 @@ def survives(
         The ranges of the loop; None where it is not certified.
     S_max : float
         Bound of ‖S‖∞.
-    own, own_words : OwnSet or None, sequence of str
-        What is known of the loop on the case's own set, and why, in clauses; None: its kind has no
-        set.
+    own, own_findings : OwnSet or None, sequence of Finding
+        What is known of the loop on the case's own set, and why; None: its kind has no set.
     other_damping : str
         What that set does not keep, in words.
     closer : sequence of (name, stable, peak)
@@ -343,49 +347,49 @@ def survives(
 
     Returns
     -------
-    VerdictLine
+    Check
         Failed, warned, unknown or passed.
     """
     figures = {**(figures or {}), **({} if own is None else {"set": own.value})}
+    line = partial(Check, "survives", figures=figures)
     if survival is None:
-        if own is OwnSet.BROKEN:
-            return VerdictLine.of(State.FAILED, own_words, figures)
-        return VerdictLine.of(State.UNKNOWN, ("the loop could not be perturbed",), figures)
+        broken = own is OwnSet.BROKEN
+        known = tuple(own_findings) if broken else ()
+        return line(State.FAILED if broken else State.UNKNOWN, known or (Reason.NOT_PERTURBED(),))
     (low, high), damping = survival.stable_shift, survival.stable_damping
+    denied, rest, followed = survival.contradiction, survival.statics, SurvivalOptions()
     failed, warned = own is OwnSet.BROKEN, own in (OwnSet.UNPROVEN, OwnSet.NONE)
-    said = [survival.contradiction, *own_words[:1], f"stable for resonances {_range(low, high)}"]
-    if not (low <= -options.least_shift and high >= options.least_shift):
+    found = [*([] if denied is None else [denied]), *own_findings[:1]]
+    if low <= -options.least_shift and high >= options.least_shift:
+        found.append(Reason.STABLE_SHIFT())
+    else:
         warned = True
-        said[-1] += f", and +-{100 * options.least_shift:g} % is the least to accept"
+        found.append(Reason.NARROW_SHIFT())
     if not (damping[0] <= options.least_factors[0] and damping[1] >= options.least_factors[1]):
         warned = True
-        between = f"between {damping[0]:.3g} and {damping[1]:.3g} times the model's"
-        said.append(f"unstable where damping is not {between}")
+        found.append(Reason.NARROW_DAMPING())
     if survival.unstable_poles_hz:
         warned = True
-        at = ", ".join(f"{hz:.4g}" for hz in survival.unstable_poles_hz[:3])
-        said.append(f"the controller by itself is unstable (poles at {at} Hz)")
+        found.append(Reason.CONTROLLER_UNSTABLE())
     for name, stable, peak in closer:
         if not stable:
             failed = True
-            said.insert(0, f"unstable on {name}")
+            found.insert(0, Reason.CLOSER_UNSTABLE(model=name))
         elif not peak <= (1.0 + options.closer_peak) * S_max:
             warned = True
-            said.append(f"peak of S {peak:.3g} on {name}")
-    more = "" if survival.S_max_slack < STATED else f"{1.0 + survival.S_max_slack:.6g} "
-    said.append(f"within {more}S_max {_range(*survival.S_max_shift)}")
-    said += [*own_words[1:], other_damping]
-    failed = failed or bool(survival.contradiction)
+            found.append(Reason.CLOSER_PEAK(model=name, peak=peak))
+    loose = survival.S_max_slack >= STATED
+    found.append(Reason.WITHIN_LOOSER(factor=1.0 + survival.S_max_slack) if loose
+                 else Reason.WITHIN())  # fmt: skip
+    found += own_findings[1:]
+    if other_damping:
+        found.append(Reason.OTHER_DAMPING(words=other_damping))
+    if rest.differentiates:
+        found += [Reason.DIFFERENTIATES(), Reason.STATIC_SHARE()]
+    failed = failed or denied is not None
     state = State.FAILED if failed else State.WARNED if warned else State.PASSED
     if own is OwnSet.SEARCHED and state is State.PASSED:
         state = State.UNKNOWN
-    rest, followed = survival.statics, SurvivalOptions()
-    if rest.differentiates:
-        said += [
-            f"almost a differentiator: {spoken('1 N')} at rest moves the stage "
-            f"{with_unit(rest.compliance, spoken('m'), 2)}",
-            f"|K(0)| is {100 * rest.share:.2g} % of |K| at the bandwidth",
-        ]
     figures |= {
         "stable_shift": list(survival.stable_shift),
         "S_max_shift": list(survival.S_max_shift),
@@ -404,10 +408,10 @@ def survives(
         "robust_set": {OwnSet.KEPT: True, OwnSet.BROKEN: False}.get(own) if own else None,
         "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
-    return VerdictLine.of(state, said, figures)
+    return line(state, tuple(found))
 
 
-def deployable(survival: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
+def deployable(survival: Survival | None, sampling: Sampling | None = None) -> Check:
     """Write the line `deployable` before `deploy`.
 
     Parameters
@@ -417,31 +421,18 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
 
     Returns
     -------
-    VerdictLine
+    Check
         Whether it is designed as it runs, or what delay its margins leave.
     """
     figures: dict[str, float] = {}
+    line = partial(Check, "deployable", figures=figures)
     if survival is not None:
-        figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
-    if sampling is not None and survival is not None and not survival.contradiction:
-        words = (
-            f"designed and judged at {sampling.rate_hz:g} Hz with a delay of "
-            f"{sampling.delay_us:g} us, hold and delay exact; run deploy for the code"
-        )
+        figures |= {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
+    if sampling is not None and survival is not None and survival.contradiction is None:
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
-        return VerdictLine.of(State.PASSED, (words,), figures)
+        return line(State.PASSED, (Reason.DESIGNED_SAMPLED(),))
     if survival is None or sampling is not None or not math.isfinite(survival.delay):
-        return VerdictLine.of(State.UNKNOWN, ("not judged yet: run deploy",), figures)
-    rate = 1.5 / survival.delay  # one period of delay, and half a period of hold
-    words = (
-        f"below {float(f'{rate:.3g}'):g} Hz hold and one sample of delay use up the delay margin "
-        f"of {with_unit(survival.delay, 's')}"
-    )
-    clauses = ("not judged yet: run deploy", words)
-    return VerdictLine.of(State.UNKNOWN, clauses, figures | {"unstable_below_rate_hz": rate})
-
-
-def _range(low: float, high: float) -> str:
-    beyond = [">" if abs(end) >= 0.999 * SurvivalOptions().reach else "" for end in (low, high)]
-    shown = [inwards(100.0 * end, 2, 3) for end in (low, high)]  # less is none
-    return f"{beyond[0]}{shown[0]:+g} to {beyond[1]}{shown[1]:+g} %"
+        return line(State.UNKNOWN, (Reason.NOT_DEPLOYED(),))
+    # one period of delay, and half a period of hold
+    figures["unstable_below_rate_hz"] = 1.5 / survival.delay
+    return line(State.UNKNOWN, (Reason.NOT_DEPLOYED(), Reason.DELAY_MARGIN()))

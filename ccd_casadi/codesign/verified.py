@@ -15,9 +15,10 @@ import numpy as np
 
 from ccd_casadi.codesign.final_judgement import OtherDamping, judge_on_model
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import controller_dict
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.codesign.verdict import VerdictLine, VerdictOptions, search_evidence, survives
+from ccd_casadi.codesign.verdict import Check, VerdictOptions, search_evidence, survives
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -127,10 +128,10 @@ class Verified(ABC):
         return controller_dict(self.controller)
 
     @abstractmethod
-    def certified_line(self) -> VerdictLine:
+    def certified_line(self) -> Check:
         """What its certificate rests on."""
 
-    def survives_line(self) -> VerdictLine:
+    def survives_line(self) -> Check:
         """What the loop survives off its model, and whether the case's own set is kept."""
         damping = "" if self.damping is None else self.damping.words
         line = survives(
@@ -144,30 +145,29 @@ class Verified(ABC):
         return {}
 
     @abstractmethod
-    def gap_words(self) -> str:
-        """What the whole inner problem has found better at θ."""
+    def better(self) -> Finding:
+        """What the whole inner problem has found better at θ, by `inner_gap`."""
 
-    def no_gradient_words(self) -> str:
-        """Why J may have no gradient at θ; nothing where it always has one."""
-        return ""
+    def no_gradient(self) -> Finding | None:
+        """Why J may have no gradient at θ; None where it always has one."""
+        return None
 
     def searched(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
-    ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
-        """Where something better was looked for and not found, in clauses and figures."""
+    ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
+        """Where something better was searched for and not found, and figures of the line."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return search_evidence(starts, optima, global_check, self.bound_words)
+        return search_evidence(starts, optima, global_check, self.bound())
 
     @cached_property
     def judgement(self) -> Judgement:
         """On the plants as their function returned them."""
         return judge_on_model(self.problem, self.theta, self.controller)
 
-    @property
-    def bound_words(self) -> str:
+    def bound(self) -> Finding:
         """What no controller exceeds at θ."""
-        return "gap not known"
+        return Reason.GAP_UNKNOWN()
 
 
 @dataclass(frozen=True)

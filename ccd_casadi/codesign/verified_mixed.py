@@ -1,12 +1,13 @@
 """A verified design with a mixed-sensitivity controller: its figures, checks and lines."""
 
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, ClassVar
 
 from ccd_casadi.codesign.final_judgement import ReferenceCheck, RobustCheck
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import mixed_dict
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
+from ccd_casadi.codesign.verdict import Check, OwnSet, State
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -15,7 +16,7 @@ from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import Design
 
 
-def robust_words(robust: RobustCheck) -> dict[str, Any]:
+def set_findings(robust: RobustCheck) -> dict[str, Any]:
     """Arguments of `survives` for a set that was searched along its shift.
 
     Parameters
@@ -26,10 +27,13 @@ def robust_words(robust: RobustCheck) -> dict[str, Any]:
     Returns
     -------
     dict
-        `own` and `own_words`.
+        `own` and `own_findings`.
     """
     own = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
-    return {"own": own, "own_words": (robust.words,)}
+    why = Reason.SET_KEPT if robust.passed else Reason.SET_NOT_KEPT
+    why = Reason.SET_UNSTABLE if robust.peak == inf else why
+    at = {"shift": robust.at.shift, "damping": robust.at.damping}
+    return {"own": own, "own_findings": (why(plants=robust.plants, peak=robust.peak, **at),)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,30 +122,29 @@ class VerifiedDesign(Verified):
             found["closer_models"] = all(stable)
         return found
 
-    def certified_line(self) -> VerdictLine:
+    def certified_line(self) -> Check:
         design, bounds = self.design.figures, self.problem.inner.bounds
         norm, norm_bound = design.certificate.norm, design.certificate.norm_bound
         figures = {"norm": norm, "norm_bound": norm_bound}
         figures["sensitivity_peak"] = design.sensitivity_peak
-        words = "closed loop stable, every bound and constraint met"
-        compliance = ""
+        found = [Reason.BOUNDS_MET()]
+        if not design.certified:
+            found = [Reason.NOT_CERTIFIED()]
+        elif not self.feasible:
+            found = [Reason.BOUND_NOT_MET(bounds=list(bounds))]
         if "compliance_max" in bounds:
             figures["compliance_max"] = design.compliance
-            compliance = f"compliance at most {1e6 * design.compliance:.4g} um/N"
-        if not design.certified:
-            words = "the closed loop is not certified"
-        elif not self.feasible:
-            words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
+            found.append(Reason.COMPLIANCE())
         good = design.certified and self.feasible
-        clauses = (words, compliance, f"norm {norm:.6g} <= {norm_bound:.6g}")
-        return VerdictLine.of(State.PASSED if good else State.FAILED, clauses, figures)
+        state = State.PASSED if good else State.FAILED
+        return Check("certified", state, (*found, Reason.NORM()), figures)
 
     def own_set(self) -> dict[str, Any]:
         found = [
             (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
             for check in self.references
         ]
-        return {"closer": found, **({} if self.robust is None else robust_words(self.robust))}
+        return {"closer": found, **({} if self.robust is None else set_findings(self.robust))}
 
-    def gap_words(self) -> str:
-        return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"
+    def better(self) -> Finding:
+        return Reason.WEIGHTS_BETTER()

@@ -3,21 +3,22 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     bound_words,
-    box_words,
+    box_findings,
     design_dict,
     proof_dict,
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure.bounds import Bounds, kind_and_channel
 from ccd_casadi.fixed_structure.certificate import SetCertificate
@@ -31,11 +32,17 @@ from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import (
+    Scenario,
+    state_of,
+    structured_of,
+    with_state,
+    with_structured,
+)
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import HZ, counted, distinct_texts
+from ccd_casadi.support.text import HZ
 
 if TYPE_CHECKING:
     from ccd_casadi.fixed_structure.box_proof import Proof
@@ -55,18 +62,19 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
     """The climbs from a certified design with parameters κ (SI)."""
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
-    def climbed(**easier: object) -> float:
-        eased = with_structured(problem, minimise="bandwidth", **easier)
+    def climbed(easier: CoDesignProblem) -> float:
+        eased = with_structured(easier, minimise="bandwidth")
         value = structured_value(from_controller(eased, kappa.tolist()), theta)
         return value.bandwidth if value.feasible else float("nan")
 
-    return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))
+    alone = with_state(problem, scenarios=((0, model),))
+    return Costs(climbed(alone), climbed(with_structured(problem, sampling=None)))
 
 
 class Gap(Protocol):
     """What is known of every controller, of the extension `limitations`."""
 
-    def words(self, bandwidth: float) -> str:
+    def finding(self, bandwidth: float) -> Finding:
         """Of the verdict, with a design's ω_b in rad/s."""
 
     def entry(self, bandwidth: float) -> dict[str, Any]:
@@ -169,7 +177,7 @@ class VerifiedStructured(Verified):
                 for optimum in self.optima
             ],
             "rounds": self.rounds,
-            "anchors": [list(kappa) for kappa in structured.warm_starts],
+            "anchors": [list(kappa) for kappa in structured.state.warm_starts],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
@@ -182,7 +190,7 @@ class VerifiedStructured(Verified):
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
                 f"{entry}_raced": None if self.multistart is None else self.multistart.value,
-                "error_anchors": [list(kappa) for kappa in structured.error_warm_starts],
+                "error_anchors": [list(kappa) for kappa in structured.state.error_warm_starts],
             }
         if structured.uncertainty.ranges:
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
@@ -197,7 +205,7 @@ class VerifiedStructured(Verified):
     def _robust_entry(self) -> dict[str, Any]:
         """The judge on a lattice of the box, and the worst plant that was searched."""
         stable = [plant for plant in self.wide.plants if plant.stable]
-        scenarios = structured_of(self.problem).scenarios
+        scenarios = state_of(self.problem).scenarios
         return {
             **robust_dict(self.wide, self.checked, self.worst),
             "stable": len(stable) == len(self.wide.plants),
@@ -213,7 +221,7 @@ class VerifiedStructured(Verified):
         if judged is None or not all(plant.stable for plant in judged.plants):
             return {}
         uncertain, low = uncertain_plant(self.problem, self.theta), bounds.omega_low / HZ
-        points = [(option, tuple(point)) for option, point in own.scenarios]
+        points = [(option, tuple(point)) for option, point in own.state.scenarios]
         points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
         shares = [bounds.shares(plant) for plant in judged.plants]
         found = {}
@@ -244,73 +252,59 @@ class VerifiedStructured(Verified):
     def controller_entry(self) -> dict[str, Any]:
         return sections_controller(self.design, self.problem.sampling)
 
-    def certified_line(self) -> VerdictLine:
+    def certified_line(self) -> Check:
         judged = self.design.certificate
-        figures = {} if judged is None else {"figures_over_bounds": judged.worst}
+        figures: dict[str, Any] = {} if judged is None else {"figures_over_bounds": judged.worst}
+        line = partial(Check, "certified", figures=figures)
         if not self.certified:
-            return VerdictLine.of(State.FAILED, (self.design.words,), figures)
+            return line(State.FAILED, (Reason.JUDGED(words=self.design.words),))
         if not self.feasible:
-            words = "certified, but a constraint on theta is not met"
-            return VerdictLine.of(State.FAILED, (words,), figures)
+            return line(State.FAILED, (Reason.CONSTRAINT_NOT_MET(),))
         count = 0 if judged is None else len(judged.plants)
         untested = () if judged is None else judged.grid_only
         most, levels = 1.0 + self.proof.slack, self.proof.levels
         on_grid = bound_words(name for name in untested if not levels.get(name, math.inf) <= most)
-        where = "the model" if count == 1 else f"the {count} plants"
-        words = f"stable and within every bound on {where} that it was designed on"
+        kept = (Reason.JUDGED_ON_MODEL if count == 1 else Reason.JUDGED_ON_PLANTS)(plants=count)
         if on_grid:  # a check that does not exist for a sampled loop is not passed
-            clauses = (words, f"{', '.join(on_grid)} on a grid of frequencies alone")
-            return VerdictLine.of(State.WARNED, clauses, {**figures, "on_grid_alone": on_grid})
-        return VerdictLine.of(State.PASSED, (words,), figures)
+            figures["on_grid_alone"] = on_grid
+            return line(State.WARNED, (kept, Reason.ON_GRID_ALONE()))
+        return line(State.PASSED, (kept,))
 
     def own_set(self) -> dict[str, Any]:
-        return box_words(self.wide, self.checked, self.proof, self.worst, self.drawn,
-                         along=self.along)  # fmt: skip
+        return box_findings(self.wide, self.checked, self.proof, self.worst, self.drawn,
+                            along=self.along)  # fmt: skip
 
     @property
     def optima(self) -> tuple[BandwidthOptimum, ...]:
         """Where the multi-start search at θ ended."""
         return () if self.multistart is None else self.multistart.design.local_optima
 
-    def gap_words(self) -> str:
-        if self.multistart is None:
-            return ""
-        figure = self.problem.figure
-        here, there = figure.shown(self.value), figure.shown(self.multistart.value)
-        return (
-            f"a multi-start search at this theta found a controller with {there} instead of {here}"
-        )
+    def better(self) -> Finding:
+        found = math.nan if self.multistart is None else self.multistart.value
+        key = self.problem.figure.key
+        return Reason.CONTROLLER_BETTER(merit=key, better=found, own=self.value)
 
-    def no_gradient_words(self) -> str:
-        off = self.design.kkt_residual
-        words = "no gradient over theta, since the search over the controller ended"
-        return f"{words} {off:.1e} from its optimum"
+    def no_gradient(self) -> Finding:
+        return Reason.NO_GRADIENT(controller_residual=self.design.kkt_residual)
 
-    @property
-    def bound_words(self) -> str:
-        return super().bound_words if self.gap is None else self.gap.words(self.bandwidth)
+    def bound(self) -> Finding:
+        return super().bound() if self.gap is None else self.gap.finding(self.bandwidth)
 
     def searched(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
-    ) -> tuple[tuple[str, ...], Mapping[str, Any]]:
+    ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
         known, figures = super().searched(outcome, global_check)
         if self.multistart is None:
             return known, figures
-        found, of = [optimum.bandwidth / HZ for optimum in self.optima], ""
-        if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
-            of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
-        words = f"{multistart_words(found)}{of}"
+        ends, figure = Reason.MULTISTART(), self.problem.figure
+        if self.multistart.feasible and figure is not BANDWIDTH:
+            ends = Reason.MULTISTART_OF(merit=figure.key, value=self.multistart.value)
         design = self.multistart.design
         if design.found is not None and design.found < DesignOptions.repeats:
-            once = f"its best was not found again from {counted(design.starts, 'start')}"
-            known = (*known[:1], once, *known[1:])
+            known = (*known[:1], Reason.NOT_REPEATED(multistart=design.starts), *known[1:])
+        found = [optimum.bandwidth / HZ for optimum in self.optima]
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
-        return (*known, words), figures
-
-
-def multistart_words(ends: Sequence[float]) -> str:
-    """Where the searches of a multi-start search ended, in Hz, each apart from the others."""
-    return f"a multi-start search at this theta ended at {', '.join(distinct_texts(ends))} Hz"
+        return (*known, ends), figures
 
 
 def _plant_words(names: Sequence[str], option: int, point: Sequence[float]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler
@@ -55,7 +55,7 @@ class WorkingSet:
     ) -> "WorkingSet":
         """Without the plants that do not hold the controller there."""
         problem = self.sampler.problem
-        scenarios = structured_of(problem).scenarios
+        scenarios = state_of(problem).scenarios
         if len(scenarios) <= options.most_plants:
             return self
         here = JointModel(problem, models, at, 0.0).beginning
@@ -72,7 +72,7 @@ class WorkingSet:
         kept |= {number for number, one in enumerate(scenarios) if one in self.back}
         counted = tuple(one for number, one in enumerate(scenarios) if number in kept)
         aside = (one for number, one in enumerate(scenarios) if number not in kept)
-        changed = with_structured(problem, scenarios=counted)
+        changed = with_state(problem, scenarios=counted)
         return WorkingSet(self.sampler.of(changed), (*self.aside, *aside), self.back)
 
     def on_worse_plants(
@@ -135,8 +135,8 @@ def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
     """
     trace = sampler.trace
     trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    known = structured_of(sampler.problem).scenarios
-    return sampler.of(with_structured(sampler.problem, scenarios=(*known, *scenarios)))
+    known = state_of(sampler.problem).scenarios
+    return sampler.of(with_state(sampler.problem, scenarios=(*known, *scenarios)))
 
 
 def holding(

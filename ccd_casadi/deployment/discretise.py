@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.analysis.sampled_figures import SampledFigures, loop_figures, worst_figures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
-from ccd_casadi.deployment.realisation import LoopChannel
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.lti.ports import BreakPoint

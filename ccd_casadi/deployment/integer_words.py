@@ -2,13 +2,14 @@
 
 from math import isfinite
 
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.deployment.fixed_point import FixedPoint
 from ccd_casadi.deployment.integer_loop import RoundingBound
 from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware
 from ccd_casadi.support.text import spoken, with_unit
 
 
-def rounding_words(found: RoundingBound) -> str:
+def rounding_finding(found: RoundingBound) -> Finding:
     """What integers add.
 
     Parameters
@@ -17,12 +18,10 @@ def rounding_words(found: RoundingBound) -> str:
 
     Returns
     -------
-    str
+    Finding
     """
-    if not isfinite(found.largest):
-        return f"no bound was found of what rounding to {found.bits} bits adds"
-    most = with_unit(found.largest, spoken("m"))
-    return f"rounding to {found.bits} bits moves y by {most} at most"
+    why = Reason.ROUNDING if isfinite(found.largest) else Reason.ROUNDING_UNKNOWN
+    return why(bits=found.bits, largest=found.largest)
 
 
 def integer_words(
@@ -48,7 +47,7 @@ def integer_words(
     count = spoken(f"a count of {', of '.join(counts)}")
     first = f"{fixed.bits} bits, saturating; {count}; coefficients judged as rounded"
     faults = integer_faults(rounding, moved)
-    added = () if faults or rounding is None else (rounding_words(rounding),)
+    added = () if faults or rounding is None else (rounding_finding(rounding).words(),)
     return first, *added, *faults
 
 
@@ -69,7 +68,7 @@ def integer_faults(rounding: RoundingBound | None, moved: OnHardware | None) -> 
     if not rounding.largest <= moved.window:
         window = with_unit(moved.window, spoken("m"))
         beyond = f", beyond its window, {window}" if isfinite(rounding.largest) else ""
-        parts.append(f"{rounding_words(rounding)}{beyond}")
+        parts.append(f"{rounding_finding(rounding).words()}{beyond}")
     full = [name for name, move in moved.ways.items() if name in UNLIMITED and move.saturated]
     if full:
         parts.append(f"a move saturates words of {rounding.bits} bits ({full[0]})")

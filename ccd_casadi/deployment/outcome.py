@@ -1,19 +1,21 @@
 """A deployment: what was found on the way from a run's controller to code, and its verdict in
 words."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import isfinite
 from typing import Any
 
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.reasons import Finding, Reason
+from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.integer_loop import RoundingBound
-from ccd_casadi.deployment.integer_words import rounding_words
+from ccd_casadi.deployment.integer_words import rounding_finding
 from ccd_casadi.deployment.on_hardware import OnHardware
-from ccd_casadi.deployment.realisation import LoopChannel, Realisation
+from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
 from ccd_casadi.fixed_structure.judgement import Judgement
@@ -24,7 +26,7 @@ from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ, spoken
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.statics import Statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -147,11 +149,11 @@ class Deployment:
         return (*words, *self.integer_faults)
 
     @property
-    def levels(self) -> tuple[str, ...]:
+    def levels(self) -> tuple[Finding, ...]:
         """The weighted functions that exceed `weighted_level` by more than `excess` in the code."""
         figures = {} if self.judge is None else self.judge.figures
         return tuple(
-            f"|W_{name} {name}| of the code is {figures[name]:.3g} times weighted_level"
+            Reason.WEIGHTED_ABOVE(name=name, level=figures[name])
             for name in ("KS", "T")
             if figures.get(name, 0.0) > 1.0 + self.target.excess
         )
@@ -208,9 +210,7 @@ def short_status(run: FinishedRun, found: Deployment) -> str:
     return "verified"
 
 
-def deployed_line(
-    run: FinishedRun, found: Deployment, moved: OnHardware | None = None
-) -> VerdictLine:
+def deployed_line(run: FinishedRun, found: Deployment, moved: OnHardware | None = None) -> Check:
     """The line `deployable` of the run's verdict.
 
     Parameters
@@ -222,12 +222,11 @@ def deployed_line(
 
     Returns
     -------
-    VerdictLine
+    Check
         Failed where the sampled loop does not keep its target on a plant; warned where its move
         does not settle within a force limit.
     """
-    K = found.sampled
-    at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
+    K, worst = found.sampled, found.worst
     figures: dict[str, Any] = {
         "rate_hz": found.rate_hz,
         "delay": found.delay,
@@ -235,55 +234,34 @@ def deployed_line(
         "order": len(found.realisation.system.A),
         "stable": found.stable,
         "bandwidth_hz": K.bandwidth / HZ,
-        "sensitivity_peak": found.worst.figures.sensitivity_peak,
-        "worst_bandwidth_hz": found.worst.figures.bandwidth / HZ,
+        "sensitivity_peak": worst.figures.sensitivity_peak,
+        "worst_bandwidth_hz": worst.figures.bandwidth / HZ,
         "plants": 1 + len(found.members),
         "judge": None if found.judge is None else found.judge.entry,
         "move": None if moved is None else moved.limited_entry,
         "rounding": None if found.rounding is None else found.rounding.largest,
     }
+    line = partial(Check, "deployable", figures=figures)
     if found.shortfalls:
-        return VerdictLine.of(State.FAILED, (f"{at}: {found.shortfalls[0]}",), figures)
-    kept = [f"{at}: {_loop_words(K)}"]
-    if found.members:
-        kept = [f"{at}: on the model {_loop_words(K)}"]
-        worst = found.worst
-        if worst.figures is not K:
-            kept.append(
-                f"on the worst plant ({place_words(worst.at)}) {_loop_words(worst.figures)}"
-            )
-    ends = limit_words(figures["move"] or {})
-    reasons = [*filter(None, (*reason_clauses(run, found), *found.levels, ends))]
+        return line(State.FAILED, (Reason.SHORTFALL(words=found.shortfalls[0]),))
+    on_model = Reason.DEPLOYED_ON_MODEL if found.members else Reason.DEPLOYED
+    kept = [on_model(**_loop_entry(K))]
+    if found.members and worst.figures is not K:
+        plant = place_words(worst.at)
+        kept.append(Reason.WORST_PLANT(plant=plant, **_loop_entry(worst.figures)))
+    move = figures["move"] or {}
+    ends = {State.FAILED: Reason.MOVE_NOT_SETTLED, State.UNKNOWN: Reason.MOVE_UNKNOWN}
+    ended = ends.get(move.get("state", State.PASSED))
+    doubts = [*reasons(run, found), *found.levels]
+    doubts += [ended(force_limit=move["force_limit"])] if ended else []
     if found.rounding is not None:
-        kept.append(rounding_words(found.rounding))
-    if reasons:
-        return VerdictLine.of(State.WARNED, (*reasons, *kept), figures)
-    return VerdictLine.of(State.PASSED, kept, figures)
+        kept.append(rounding_finding(found.rounding))
+    return line(State.WARNED if doubts else State.PASSED, (*doubts, *kept))
 
 
-def limit_words(move: Mapping[str, Any]) -> str:
-    """Write that a move within a force limit does not settle, or that this is not known.
-
-    Parameters
-    ----------
-    move : mapping
-        As `limited_entry` of `OnHardware` gives it.
-
-    Returns
-    -------
-    str
-        Empty where it settles.
-    """
-    ends = {State.FAILED.value: "does not settle", State.UNKNOWN.value: "could not be simulated"}
-    state = move.get("state", "")
-    return (
-        spoken(f"a move within {move['force_limit']:.4g} N {ends[state]}") if state in ends else ""
-    )
-
-
-def _loop_words(found: SampledFigures) -> str:
+def _loop_entry(found: SampledFigures) -> dict[str, float]:
     """Of one plant."""
-    return f"bandwidth {found.bandwidth / HZ:.4g} Hz, peak of S {found.sensitivity_peak:.5g}"
+    return {"bandwidth_hz": found.bandwidth / HZ, "sensitivity_peak": found.sensitivity_peak}
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:
@@ -368,23 +346,18 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     str
         Empty where there is nothing to say.
     """
-    return "; ".join(reason_clauses(run, found))
+    return "; ".join(one.words() for one in reasons(run, found))
 
 
-def reason_clauses(run: FinishedRun, found: Deployment) -> list[str]:
-    """The same, a clause each."""
-    own = f"the run itself is not verified: {found.unverified}"
-    parts = [own] if found.unverified else []
+def reasons(run: FinishedRun, found: Deployment) -> list[Finding]:
+    """The same as findings."""
+    parts = [Reason.RUN_NOT_VERIFIED(words=found.unverified)] if found.unverified else []
     if share := run.case.robust.share_words:
-        parts.append(f"{share}: judged here on the {1 + len(found.members)} that it has kept alone")
+        parts.append(Reason.SHARE_ALONE(claim=share, plants=1 + len(found.members)))
     if found.shortfalls:
-        return [*parts, found.shortfalls[0]]
-    S_max, over = run.problem.inner.S_max, _over(run, found)
-    where = f" ({place_words(found.worst.at)})" if found.members else ""
+        return [*parts, Reason.JUDGED(words=found.shortfalls[0])]
+    over, plant = _over(run, found), place_words(found.worst.at) if found.members else ""
     if over > 0.0:
-        allowed = 100.0 * found.target.excess
-        parts.append(
-            f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
-            f"a deployment may exceed it by {allowed:.2g} %"
-        )
+        S_max, excess = run.problem.inner.S_max, found.target.excess
+        parts.append(Reason.PEAK_ABOVE(over=over, S_max=S_max, excess=excess, plant=plant))
     return parts

@@ -7,6 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_channels import (
+    LoopChannel,
+    along_directions,
+    scalar_channels,
+    whole_loop,
+)
 from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -24,14 +30,10 @@ from ccd_casadi.deployment.integer_loop import ranges_of_moves, rounding_bound
 from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import (
-    LoopChannel,
     Realisation,
-    along_directions,
     assemble,
     in_single,
     realise,
-    scalar_channels,
-    whole_loop,
     with_anti_windup,
 )
 from ccd_casadi.deployment.reduction import (

@@ -9,94 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
-from ccd_casadi.lti.ports import BreakPoint
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
 if TYPE_CHECKING:
     from ccd_casadi.deployment.fixed_point import FixedPoint
-
-
-@dataclass(frozen=True)
-class LoopChannel:
-    """A part of the loop, Uᵀ G V and Vᵀ K U.
-
-    Attributes
-    ----------
-    name : str
-        Its number, or "all".
-    outputs, inputs : (p, k), (m, k) array
-        U and V.
-    plant : ScaledPlant
-        Uᵀ G V.
-    controller : StateSpace
-        Vᵀ K U, SI.
-    places : tuple of BreakPoint
-        Of several sensors on one actuator.
-    """
-
-    name: str
-    outputs: Array
-    inputs: Array
-    plant: ScaledPlant
-    controller: StateSpace
-    places: tuple[BreakPoint, ...] = ()
-
-
-def whole_loop(
-    plant: ScaledPlant, controller: StateSpace, places: tuple[BreakPoint, ...] = ()
-) -> tuple[LoopChannel, ...]:
-    """The loop as one channel."""
-    p, m = plant.C.shape[0], plant.B.shape[1]
-    return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller, places),)
-
-
-def scalar_channels(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
-    """The scalar channels of a loop, or the whole loop as one channel.
-
-    Parameters
-    ----------
-    plant : ScaledPlant
-        With its decoupling directions.
-    controller : StateSpace
-        e in, u out, SI.
-
-    Returns
-    -------
-    tuple of LoopChannel
-        One for each output where plant and controller are diagonal along the directions.
-    """
-    p, m = plant.C.shape[0], plant.B.shape[1]
-    U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
-    V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
-    if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
-        return whole_loop(plant, controller)
-    omega = plant.grid * plant.omega_0
-    G, K = plant.plant_si().response(omega), controller.response(omega)
-    if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
-        return whole_loop(plant, controller)
-    found = []
-    for i in range(p):
-        u, v = U[:, [i]], V[:, [i]]
-        part = StateSpace(
-            controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
-        )
-        found.append(LoopChannel(str(i + 1), u, v, along_directions(plant, u, v), part))
-    return tuple(found)
-
-
-def along_directions(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
-    """uᵀ G v, of directions u of its outputs and v of its inputs."""
-    B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
-    return replace(plant, B=B, C=C, channels=())
-
-
-def _diagonal(response: np.ndarray, rounding: float = 1e-8) -> bool:
-    """Whether what is off the diagonal is at most this share of the gain."""
-    off = response * (1.0 - np.eye(response.shape[1]))
-    return bool(np.abs(off).max() <= rounding * np.abs(response).max())
 
 
 def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace]) -> StateSpace:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag, eigh, schur, solve_sylvester, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
-from ccd_casadi.deployment.realisation import LoopChannel
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_channels import LoopChannel, along_directions
 from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.final_judgement import RobustCheckOptions, written_plants
-from ccd_casadi.deployment.realisation import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -133,9 +133,9 @@ def _points(
     the set alone."""
     sections = structured_of(run.problem)
     if run.case.robust.share is not None:
-        return [(i, np.array(p)) for i, p in sections.scenarios]
-    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
-    return points + (lattice(uncertain, count, sections.seed) if dense else [])
+        return [(i, np.array(p)) for i, p in sections.state.scenarios]
+    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.state.scenarios)]
+    return points + (lattice(uncertain, count, sections.state.seed) if dense else [])
 
 
 def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:

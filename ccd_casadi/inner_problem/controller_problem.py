@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.text import HZ, spoken, with_unit
 from ccd_casadi.synthesis.weights import Weights
+
+if TYPE_CHECKING:
+    from ccd_casadi.budget.sources import ErrorBudget
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class ControllerProblem:
     def require_plants(self, plants: Sequence[Plant]) -> None:
         """Raise PlantError unless such a controller can be designed for each of the plants."""
 
-    def identity_with(self, weights: Weights, budget: ErrorBudget | None) -> dict[str, Any]:
+    def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
         """What else determines a design, given the weights and the budget of its problem."""
         return {}
 

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
-from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed, with_wiring
-from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant, widened
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
@@ -28,6 +26,7 @@ from ccd_casadi.support.user_code import (
 
 if TYPE_CHECKING:
     from ccd_casadi.analysis.motor import Motion
+    from ccd_casadi.plants.places import Places
 
 INSTALLED = {"site-packages", "dist-packages"}
 STANDARD = Path(ast.__file__).parent
@@ -194,7 +193,7 @@ class PlantSource:
     seconds: float = 60.0
     content: str | None = None
     fixed: tuple[tuple[str, float, str], ...] = ()
-    places: Places | None = None
+    places: "Places | None" = None
     motion: "Motion | None" = None
     wiring: Wiring = UNWIRED
     given: GivenFunction | None = field(default=None, compare=False)
@@ -273,6 +272,8 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
 def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     """By its move, its places or its fixed parameters from the plant below."""
     if source.wiring:
+        from ccd_casadi.plants.fixed_parameters import with_wiring
+
         plant = plant_from(replace(source, wiring=UNWIRED), names, lower, upper)
         return with_wiring(plant, source.wiring)
     if source.motion is not None:
@@ -286,6 +287,8 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         return with_motion(plant, motion, names, source.held, count)
     held = source.held
     if source.places is not None:
+        from ccd_casadi.plants.places import placed
+
         places = source.places
         held = {name: value for name, value in held.items() if name in places.names}
         plant = _below(replace(source, places=None), places.names, names, lower, upper)
@@ -296,14 +299,19 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         plant = model.build((*names, *held), **dict(source.options))
     else:
         function = _own_function(source)
-        function = fixed_model(widened(function) if source.wide else function, held)
         from ccd_casadi.plants.differenced import user_plant
+        from ccd_casadi.plants.fixed_parameters import fixed_model
 
+        function = fixed_model(widened(function) if source.wide else function, held)
         plant = user_plant(function, names, dict(source.options), lower, upper)
         if not plant.ports:
             return plant
         words = f"compliance and error budget are {plant.between}; the move's error too"
         return replace(plant, notes=lambda theta: (*plant.notes(theta), words))
+    if not held:
+        return plant
+    from ccd_casadi.plants.fixed_parameters import with_fixed
+
     return with_fixed(plant, held)
 
 

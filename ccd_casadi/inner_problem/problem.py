@@ -6,10 +6,10 @@ beside the samples that it determines.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.inner_problem.controller_problem import (
     ControllerProblem,
     FigureOfMerit,
@@ -38,6 +38,9 @@ from ccd_casadi.support.text import use_units
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
+
+if TYPE_CHECKING:
+    from ccd_casadi.budget.sources import ErrorBudget
 
 NUMERICS = 12  # raised whenever a change of ours moves the numbers that a sample holds
 
@@ -99,7 +102,7 @@ class CoDesignProblem(NotebookHtml):
     method: str = "search"
     robust: RobustSet | None = None
     controller: ControllerProblem = field(default_factory=MixedSensitivityProblem)
-    budget: ErrorBudget | None = None
+    budget: "ErrorBudget | None" = None
     cost_unit: str = ""
     listed: tuple[tuple[str, tuple[float, ...]], ...] = ()
     spoken: tuple[str, str] = ("m", "N")

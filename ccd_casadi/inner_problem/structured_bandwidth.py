@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     warm_starts_at,
 )
-from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import state_of, structured_of, with_state
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -160,7 +160,7 @@ def stated_time(
     fresh : Yield or None
         How many plants drawn from the box need no longer; None without a box.
     """
-    seed, count = structured_of(problem).seed, options.fresh
+    seed, count = state_of(problem).seed, options.fresh
     uncertain, motion = uncertain_plant(problem, theta), motion_of(problem, theta)
     on_set = exact_times(problem, motion, plants_of(problem, theta), K)
     latest = latest_plant(problem, theta, K, seed + options.fresh_seed)[0]
@@ -228,8 +228,8 @@ class ProblemAt:
         problem, structured = self.problem, structured_of(self.problem)
         return synthesise_sections(
             self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
-            starts=starts or 0, most_starts=most_starts, seed=structured.seed, initial=initial,
-            only_initial=starts is None,
+            starts=starts or 0, most_starts=most_starts, seed=structured.state.seed,
+            initial=initial, only_initial=starts is None,
             frequencies=structured.frequencies, progress=tell, workers=workers,
         )  # fmt: skip
 
@@ -255,7 +255,7 @@ class ProblemAt:
         """The least of the problem's figure from a certified design and its warm starts."""
         problem, structured = self.problem, structured_of(self.problem)
         bounds = bounds_of(problem)
-        started = with_structured(problem, warm_starts=structured.error_warm_starts)
+        started = with_state(problem, warm_starts=structured.state.error_warm_starts)
         return least_value(
             self.plants, bounds, design, self.goal, sampling=structured.sampling,
             least_bandwidth=structured.bandwidth_least,
@@ -317,7 +317,7 @@ def structured_value(
     if problem.figure is not BANDWIDTH and not (made and made.certified):
         # Controllers of least error meet every bound where those of most bandwidth may not.
         structured = structured_of(problem)
-        started = with_structured(problem, warm_starts=structured.error_warm_starts)
+        started = with_state(problem, warm_starts=structured.state.error_warm_starts)
         others = warm_starts_at(started, structure_of(problem), here.plants, bounds_of(problem))
         if others:
             made = here.searched(others, workers=workers)

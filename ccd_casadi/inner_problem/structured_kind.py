@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.inner_kind import InnerKind
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
-from ccd_casadi.inner_problem.structured_problem import structured_of
+from ccd_casadi.inner_problem.structured_problem import state_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -41,7 +41,7 @@ class FixedStructure(InnerKind):
         return "of fixed structure", runs
 
     def require_function(self) -> None:
-        if not structured_of(self.problem).warm_starts:
+        if not state_of(self.problem).warm_starts:
             words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
             raise UserError(f"the problem of a fixed structure {words}")
 

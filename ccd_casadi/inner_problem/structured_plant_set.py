@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
     of_sensor,
+    state_of,
     structured_of,
     with_structured,
 )
@@ -295,7 +296,7 @@ def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPl
     list of ScaledPlant
         The problem's scenarios, or the corners of the box where it has none yet.
     """
-    uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
+    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
     known = [(option, np.array(point)) for option, point in scenarios]
     return uncertain.plants(known or uncertain.corners())
 
@@ -324,10 +325,10 @@ def warm_starts_at(
         κ in SI.
     """
     structured = structured_of(problem)
-    if not structured.warm_starts:
+    if not structured.state.warm_starts:
         return []
     first = scaled_plant(problem, problem.start)
-    warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
+    warm_starts = [np.array(kappa) for kappa in structured.state.warm_starts]
 
     def nearer(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds

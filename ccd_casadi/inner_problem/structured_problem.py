@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from ccd_casadi.budget.sources import ErrorBudget
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import (
@@ -28,6 +27,7 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
 
 if TYPE_CHECKING:  # that states its controller by this module
+    from ccd_casadi.budget.sources import ErrorBudget
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 Scenario = tuple[int, tuple[float, ...]]
@@ -55,6 +55,26 @@ class Uncertainty:
     gain: float = 0.0
     options: tuple[Options, ...] = ()
     ranges: tuple[tuple[str, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """What a search has found: with it v(θ) is the best of the climbs from the warm starts, on the
+    plants of the scenarios. The problem that a case states has none yet.
+
+    Attributes
+    ----------
+    warm_starts, error_warm_starts : tuple of κ in SI
+        Of the largest bandwidth; of the least RMS error or move time.
+    scenarios : tuple of (option, point of the box)
+    seed : int
+        Of the multi-start search that finds them.
+    """
+
+    warm_starts: tuple[tuple[float, ...], ...] = ()
+    error_warm_starts: tuple[tuple[float, ...], ...] = ()
+    scenarios: tuple[Scenario, ...] = ()
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -118,21 +138,18 @@ class StructuredProblem(ControllerProblem):
     sampling : Sampling or None
         Hold and delay.
     uncertainty : Uncertainty
-    starts, seed : int
+    starts : int
         Of the multi-start search, which finds the warm starts and the scenarios.
     frequencies : tuple of two floats, optional
         Bounds of those of K, rad/s, alike at every θ; None: by the plant at the start.
-    warm_starts, scenarios : tuple of κ in SI, tuple of (option, point of the box)
-        With these v(θ) is the best of the climbs from the warm starts, on the plants of the
-        scenarios. Both are empty before the search.
     minimise, bandwidth_least : str, float
         "bandwidth", "rms_error" or "move_time"; the last two at ω_b >= bandwidth_least (rad/s).
     channels : tuple of ChannelProblem
         Of a plant with several outputs.
     bandwidth_of : str or None
         Of several sensors on one actuator: the channel whose error counts.
-    error_warm_starts : tuple of κ in SI
-        Of the least RMS error or move time.
+    state : SearchState
+        What a search has found, apart from all that the case states.
     """
 
     kernels: ClassVar[tuple[str, ...]] = ("loops",)
@@ -145,15 +162,12 @@ class StructuredProblem(ControllerProblem):
     sampling: Sampling | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     starts: int = 12
-    seed: int = 0
     frequencies: tuple[float, float] | None = None
-    warm_starts: tuple[tuple[float, ...], ...] = ()
-    scenarios: tuple[Scenario, ...] = ()
     minimise: str = "bandwidth"
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
-    error_warm_starts: tuple[tuple[float, ...], ...] = ()
     bandwidth_of: str | None = None
+    state: SearchState = field(default_factory=SearchState)
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -219,10 +233,11 @@ class StructuredProblem(ControllerProblem):
         if not kappa:
             return self
         name = "warm_starts" if self.figure is BANDWIDTH else "error_warm_starts"
-        others = (known for known in getattr(self, name) if known != kappa)
-        return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
+        others = (known for known in getattr(self.state, name) if known != kappa)
+        found = {name: (kappa, *others)[:most]}
+        return replace(self, state=replace(self.state, **found))  # type: ignore[arg-type]
 
-    def identity_with(self, weights: Weights, budget: ErrorBudget | None) -> dict[str, Any]:
+    def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
         """Its own, ω_T that bounds KS and T, and what moves the stage where that counts."""
         found = {"sections": self.identity() | {"omega_T": weights.omega_T}}
         if self.figure is RMS_ERROR:
@@ -242,10 +257,10 @@ class StructuredProblem(ControllerProblem):
             "uncertainty": vars(self.uncertainty)
             | {"options": [dict(options) for options in self.uncertainty.options]},
             "starts": self.starts,
-            "seed": self.seed,
+            "seed": self.state.seed,
             "frequencies": self.frequencies,
-            "anchors": self.warm_starts,
-            "members": self.scenarios,
+            "anchors": self.state.warm_starts,
+            "members": self.state.scenarios,
         }
         if not self.uncertainty.ranges:  # as stores knew it before
             del found["uncertainty"]["ranges"]
@@ -258,7 +273,7 @@ class StructuredProblem(ControllerProblem):
         if self.bandwidth_of is not None:
             found["bandwidth_of"] = self.bandwidth_of
         if self.figure is not BANDWIDTH:
-            found["least_error"] = [self.bandwidth_least, self.error_warm_starts]
+            found["least_error"] = [self.bandwidth_least, self.state.error_warm_starts]
         return found
 
 
@@ -275,6 +290,37 @@ def structured_of(problem: "CoDesignProblem") -> StructuredProblem:
     """
     assert isinstance(problem.controller, StructuredProblem)
     return problem.controller
+
+
+def state_of(problem: "CoDesignProblem") -> SearchState:
+    """Take what a search has found for a structured problem.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    SearchState
+    """
+    return structured_of(problem).state
+
+
+def with_state(problem: "CoDesignProblem", **changes: object) -> "CoDesignProblem":
+    """Change fields of a structured problem's `SearchState`; what the case states stays.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    changes
+        Fields by name.
+
+    Returns
+    -------
+    CoDesignProblem
+    """
+    state = replace(state_of(problem), **changes)  # type: ignore[arg-type]
+    return with_structured(problem, state=state)
 
 
 def with_structured(problem: "CoDesignProblem", **changes: object) -> "CoDesignProblem":

@@ -35,7 +35,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario, structured_of
+from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -115,7 +115,7 @@ class DesignOnBox:
         )  # fmt: skip
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
-            seed = structured_of(problem).seed + turn
+            seed = state_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed)
             late = f"{1e3 * time:.5g} ms" if np.isfinite(time) else "not settled"
             tell(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
@@ -145,8 +145,8 @@ class DesignOnBox:
         structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
         if not uncertain.names:
             return list(uncertain.corners()[: 1 + len(structured.uncertainty.options)])
-        points = lattice(uncertain, options.lattice, structured.seed + options.lattice_seed)
-        known = [(option, np.array(point)) for option, point in structured.scenarios]
+        points = lattice(uncertain, options.lattice, structured.state.seed + options.lattice_seed)
+        known = [(option, np.array(point)) for option, point in structured.state.scenarios]
         return [*points, (worst.option, worst.point), *known]
 
     def on_lattice(self, worst: Excess, workers: Pool | None = None) -> tuple[SetCertificate, int]:
@@ -181,7 +181,8 @@ class DesignOnBox:
         found.sort(key=lambda pair: -pair[0])
         if proof.refuted:
             found.insert(0, (np.inf, (proof.option, tuple(map(float, proof.point)))))
-        fresh = dict.fromkeys(plant for _, plant in found if plant not in structured.scenarios)
+        known = structured.state.scenarios
+        fresh = dict.fromkeys(plant for _, plant in found if plant not in known)
         return tuple(fresh)[: self.options.added]
 
     def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
@@ -193,7 +194,7 @@ class DesignOnBox:
         if not uncertain.names or self.design.controller is None:
             return None
         count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
-        rng = np.random.default_rng((structured.seed, options.fresh_seed))
+        rng = np.random.default_rng((structured.state.seed, options.fresh_seed))
         return Yield(sum(self.kept(uncertain.drawn(rng, count), workers)), count)
 
     def kept(self, points: Sequence[tuple[int, Array]], workers: Pool | None = None) -> list[bool]:
@@ -241,7 +242,7 @@ class DesignOnBox:
         problem, uncertain, plants = self.problem, self.uncertain, []
         if problem.figure is not BANDWIDTH or not uncertain.names:
             return {}
-        for option, point in structured_of(problem).scenarios or uncertain.corners():
+        for option, point in state_of(problem).scenarios or uncertain.corners():
             plant = uncertain.sloped(np.array(point), option)
             further = (np.array(point) - uncertain.nominal)[:, None, None]
             slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
@@ -300,7 +301,7 @@ def violations(
         for head in heads:
             near = [
                 float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
-                for option, point in (*structured.scenarios, *found)
+                for option, point in (*structured.state.scenarios, *found)
                 if option == head.option
             ]
             apart = not near or min(near) > options.apart
@@ -310,7 +311,7 @@ def violations(
 
     examined = 0
     for along in (lines.along_first, lines.along) if uncertain.ranges else (lines.along,):
-        seed = structured.seed + turn
+        seed = structured.state.seed + turn
         heads, more = worst_plants(loop, seed, count, workers=workers, along=along)
         heads, examined = sorted([*before, *heads], key=lambda head: -head.value), examined + more
         worse = fresh(heads)

@@ -18,7 +18,12 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant, with_channels
-from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import (
+    state_of,
+    structured_of,
+    with_state,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -67,7 +72,7 @@ def search_starts(
     SectionsDesign
     """
     here, structured = ProblemAt(problem, theta), structured_of(problem)
-    warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
+    warm_starts = [np.array(kappa) for kappa in structured.state.warm_starts]
     starts = None if only_warm_starts else structured.starts
     made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
     least = options.least_starts
@@ -140,7 +145,7 @@ def prepared(
     problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
     scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
-    problem = with_structured(problem, scenarios=scenarios)
+    problem = with_state(problem, scenarios=scenarios)
 
     made = search_starts(problem, problem.start, tell, workers, only_warm_starts, options)
     worst: Excess | None = None
@@ -152,7 +157,7 @@ def prepared(
         if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
         last = wider is None
-        problem = with_structured(wider or problem, warm_starts=_warm_starts(made, options))
+        problem = with_state(wider or problem, warm_starts=_warm_starts(made, options))
         if not last:
             made = search_starts(problem, problem.start, tell, workers, True, options)
         if last or not made.certified:  # which has a few starts more where warm ones lead to none
@@ -161,7 +166,7 @@ def prepared(
         if not made.certified:
             break
     if made.certified:
-        problem = with_structured(problem, warm_starts=_warm_starts(made, options))
+        problem = with_state(problem, warm_starts=_warm_starts(made, options))
     return with_structured(problem, minimise=required), made, worst
 
 
@@ -171,8 +176,8 @@ def _wider(
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
     worst, found = DesignOnBox(problem, theta, design).worst(turn, tell, workers)
-    scenarios = (*structured_of(problem).scenarios, *found)
-    return worst, with_structured(problem, scenarios=scenarios) if found else None
+    scenarios = (*state_of(problem).scenarios, *found)
+    return worst, with_state(problem, scenarios=scenarios) if found else None
 
 
 def _warm_starts(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from ccd_casadi.analysis.loop_figures import force_response, largest_force_step,
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
@@ -23,6 +22,9 @@ from ccd_casadi.reporting.gain_figures import of_plants
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
 
+if TYPE_CHECKING:  # a move on the machine is of `deploy`
+    from ccd_casadi.deployment.on_hardware import OnHardware
+
 POINTS = 600
 STEPS = 200  # points of a force step, and again as many about its beginning
 DRAWN = 1200  # points of a curve of a move on the machine
@@ -33,9 +35,7 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
     "settled after, ms": lambda m: 1e3 * m.settled,
     "RMS error, µm": lambda m: 1e6 * m.rms_error,
     "peak error, µm": lambda m: 1e6 * m.peak_error,
-    "largest error of the last quarter, µm": lambda m: (
-        1e6 * m.last_error(SimulationOptions().watched)
-    ),
+    "largest error of the last quarter, µm": lambda m: 1e6 * m.last_error(0.25),
     "peak force, N": lambda m: float(m.peak_force.max()),
     "at the limit, %": lambda m: 100.0 * m.saturated,
 }
@@ -161,7 +161,7 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     return c.Figure(lines, words)
 
 
-def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
+def move_blocks(found: "OnHardware") -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
     words = "Free bodies are free. Hold and delay are exact."

@@ -7,8 +7,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.analysis.loop_view import LoopView, phase_deg
-from ccd_casadi.deployment.realisation import LoopChannel
 from ccd_casadi.drawing.charts import BOTTOM, LEFT, RIGHT, TOP
 from ccd_casadi.drawing.content import Area, Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY, ORANGE, WIDTH

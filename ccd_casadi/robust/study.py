@@ -9,8 +9,9 @@ from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import at_solve
-from ccd_casadi.codesign.verdict import State, VerdictLine, clauses_of
+from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import sigma_max
@@ -239,7 +240,7 @@ def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
     }
 
 
-def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
+def survival_line(run: FinishedRun, study: Study) -> Check:
     """Update the line `survives` of a run's verdict by a study.
 
     Parameters
@@ -248,47 +249,33 @@ def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
 
     Returns
     -------
-    VerdictLine
+    Check
         The solve's line and figures, with those of the study.
     """
-    before, hard, d = at_solve(run.result, "survives"), study.tolerances, study.demands
-    lost = hard.unstable
-    said = []
-    low, high = study.shift.stable
-    ends = [f"below {100.0 * low:+.2g} %"] * (low > -d.shift)
-    ends += [f"above {100.0 * high:+.2g} %"] * (high < d.shift)
-    if ends:
-        said.append(f"unstable for resonance shifts {' and '.join(ends)}")
-    if lost or not hard.worst.stable:
-        of = f"{lost} of {len(hard.judged)} plants with hardware within +-{100 * d.tolerance:g} %"
-        said.insert(0, f"{of} unstable{'' if lost else ', the worst that was searched is'}")
-    tried = (
-        f"robustness tried shifts of +-{100 * d.shift:g} %, damping times {d.damping[0]:g} to "
-        f"{d.damping[1]:g}, hardware within +-{100 * d.tolerance:g} %"
-    )
-    if not study.survives:
-        said = said or ["not stable on all plants that robustness tried"]
-    else:
-        said = ["stable on all plants that robustness tried"]
-    state = State(before.get("state", State.UNKNOWN))
+    before = Check.read("survives", at_solve(run.result, "survives"))
+    hard, d, (low, high) = study.tolerances, study.demands, study.shift.stable
+    demanded = {"shift": d.shift, "damping": list(d.damping), "tolerance": d.tolerance}
+    machines = {"plants": len(hard.judged), "unstable": hard.unstable}
+    found = [] if study.survives else [Reason.ROBUSTNESS_UNSTABLE()]
+    if low > -d.shift or high < d.shift:
+        found = [Reason.SHIFTS_UNSTABLE(stable_between=[low, high], **demanded)]
+    if hard.unstable or not hard.worst.stable:
+        why = Reason.HARDWARE_UNSTABLE if hard.unstable else Reason.WORST_HARDWARE_UNSTABLE
+        shifts = [one for one in found if one.reason is Reason.SHIFTS_UNSTABLE]
+        found = [why(**machines, **demanded), *shifts]
+    found = [Reason.ROBUSTNESS_STABLE()] if study.survives else found
+    state = before.state
     if not study.survives and state is not State.FAILED:
         state = State.WARNED
     elif state is State.UNKNOWN:
         state = State.PASSED
-    line = ("state", "words", "details")
-    figures = {key: value for key, value in before.items() if key not in line}
-    figures["robustness"] = {
-        "stable_on_all": study.survives,
-        "stable_between": list(study.shift.stable),
-        "hardware": {
-            "tolerance": hard.tolerance, "plants": len(hard.judged), "unstable": lost,
-            "worst_stable": hard.worst.stable,
-        },
-    }  # fmt: skip
-    clauses = (*said, *clauses_of(before))
+    own = {"tolerance": hard.tolerance, **machines, "worst_stable": hard.worst.stable}
+    robustness = {"stable_on_all": study.survives, "stable_between": [low, high], "hardware": own}
+    findings = (*found, *before.findings)
     if run.case.robust.share is not None:  # what it is for comes first
-        clauses = (*clauses_of(before), *said)
-    return VerdictLine.of(state, (*clauses, tried), figures)
+        findings = (*before.findings, *found)
+    findings = (*findings, Reason.ROBUSTNESS_TRIED(**demanded))
+    return Check("survives", state, findings, {**before.figures, "robustness": robustness})
 
 
 def _disk(margin: DiskMargin) -> dict[str, float]:

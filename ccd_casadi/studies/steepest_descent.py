@@ -15,10 +15,10 @@ from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.final_judgement import survived
 from ccd_casadi.codesign.result_entries import figures_dict
-from ccd_casadi.codesign.structured_entries import active_of, box_words, design_dict
+from ccd_casadi.codesign.structured_entries import active_of, box_findings, design_dict
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.verdict import VerdictLine, survives
-from ccd_casadi.codesign.verified_mixed import robust_words
+from ccd_casadi.codesign.verdict import Check, survives
+from ccd_casadi.codesign.verified_mixed import set_findings
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -84,7 +84,7 @@ class Baseline(ABC):
     @abstractmethod
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
-    ) -> tuple[StateSpace, VerdictLine]:
+    ) -> tuple[StateSpace, Check]:
         """Its controller (SI), and what that survives: the line of the verdict of a run."""
 
 
@@ -115,11 +115,11 @@ class MixedBaseline(Baseline):
 
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
-    ) -> tuple[StateSpace, VerdictLine]:
+    ) -> tuple[StateSpace, Check]:
         at = (design.figures.omega_S, design.figures.omega_T)
         K = final_design(self.problem, theta, at).controller
         found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
-        own = {} if robust is None else robust_words(robust)
+        own = {} if robust is None else set_findings(robust)
         return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 
@@ -147,14 +147,14 @@ class StructuredBaseline(Baseline):
 
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
-    ) -> tuple[StateSpace, VerdictLine]:
+    ) -> tuple[StateSpace, Check]:
         K, on_box = design.controller, DesignOnBox(self.problem, theta, design)
         worst = on_box.worst()[0]
         wide, checked, proof = on_box.judged(worst, workers)
         found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
         drawn = None if proof.conclusive else on_box.fresh_yield(workers)
         along = found is not None and found.within(*kind_of(self.problem).common_shifts())
-        own = box_words(wide, checked, proof, worst, drawn, along=along)
+        own = box_findings(wide, checked, proof, worst, drawn, along=along)
         return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 

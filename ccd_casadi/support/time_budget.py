@@ -15,8 +15,6 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from ccd_casadi.support.text import counted
-
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -69,15 +67,6 @@ class TimeBudget:
     def ended(self) -> bool:
         """Whether it ended a search that would have gone on."""
         return bool(self.left)
-
-    @property
-    def clauses(self) -> tuple[str, ...]:
-        """Of a search that it ended: what was left; none of another."""
-        if not self.ended:
-            return ()
-        left = ", ".join(counted(count, name) for name, count in self.left.items())
-        words = f"the search ended with its budget of {self.minutes:g} min, not searched: {left}"
-        return words, "a larger --budget continues from what is stored"
 
     @property
     def entry(self) -> dict[str, object]:

@@ -18,6 +18,7 @@ from oracles.helpers import problem
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import result_dict
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.survival import Survival
@@ -81,7 +82,10 @@ FAULTS: list[tuple[str, Callable[[Any], Any]]] = [
     ("optimal", lambda d: replace(d, kkt=replace(d.kkt, primal=1e-3))),
     ("survives", lambda d: replace(d, survival=None)),
     ("deployable", lambda d: replace(d, survival=None)),
-    ("survives", lambda d: replace(d, survival=replace(d.survival, contradiction="unstable"))),
+    (
+        "survives",
+        lambda d: replace(d, survival=replace(d.survival, contradiction=Reason.MODEL_UNSTABLE())),
+    ),
 ]
 
 

@@ -10,6 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
@@ -280,8 +281,8 @@ def case() -> CoDesignProblem:
 def line(kkt: KktCertificate) -> Any:
     """The verdict's."""
     return optimal(
-        kkt, level=VerifiedStructured.kkt_level, gap=0.0, tolerance=1e-3, better="",
-        searched=("", {}),
+        kkt, level=VerifiedStructured.kkt_level, gap=0.0, tolerance=1e-3,
+        better=Reason.WEIGHTS_BETTER(), searched=((Reason.GAP_UNKNOWN(),), {}),
     )  # fmt: skip
 
 

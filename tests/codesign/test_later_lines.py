@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import with_verdict_line
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page
 from ccd_casadi.drawing.paint import write_page
@@ -97,12 +98,13 @@ def test_words_from_anywhere_stay_words_and_a_study_kept_apart_changes_no_run(tm
         write_page(folder / name, Page(run_head("t", result, "", ""), ()))
     (folder / "other" / "result.json").write_text("{}")  # another run, below this one
     run, kept = run_in(folder, result), place.read_bytes()
-    line = VerdictLine(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})
-    assert with_verdict_line(run, tmp_path / "elsewhere", "deployable", line) is run
+    said = Reason.QUOTED(words=r"</table><script>\1 \g<0>")
+    line = Check("deployable", State.FAILED, (said,), {"figure": 1.0})
+    assert with_verdict_line(run, tmp_path / "elsewhere", line) is run
     old = replace(run, result={k: v for k, v in result.items() if k != "verdict"})
-    assert with_verdict_line(old, folder, "deployable", line) is old
+    assert with_verdict_line(old, folder, line) is old
     assert place.read_bytes() == kept
-    with_verdict_line(run, folder / "deploy", "deployable", line)
+    with_verdict_line(run, folder / "deploy", line)
     write_index(folder)
     for name in ("report.html", "index.html"):
         text = (folder / name).read_text()

@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structure_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import with_structured
+from ccd_casadi.inner_problem.structured_problem import with_state
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
@@ -43,7 +43,7 @@ def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:
     corners = uncertain_plant(problem, problem.start).corners()
     members = tuple((option, tuple(map(float, point))) for option, point in corners)
     kappa = tuple(STORED["sections"]["kappa"])
-    return replace(with_structured(problem, warm_starts=(kappa,), scenarios=members), start=start)
+    return replace(with_state(problem, warm_starts=(kappa,), scenarios=members), start=start)
 
 
 def test_what_the_first_order_leaves_out_is_of_second_order() -> None:

@@ -24,11 +24,11 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.reasons import Reason, within_words
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.structured_entries import kept_words, robust_dict
+from ccd_casadi.codesign.structured_entries import robust_dict
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.codesign.verified_structured import multistart_words
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure.certificate import SetCertificate
@@ -36,6 +36,7 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RobustSet
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
@@ -49,6 +50,7 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parents[2]
 KKT_LEVEL = VerifiedDesign.kkt_level
+BETTER = Reason.WEIGHTS_BETTER()
 CORNER = (55.0, 55.0)
 WEIGHTS = (1800.0 * HZ, 26.066 * HZ)  # of the verified design of case study 1
 SOUND = Survival(
@@ -66,10 +68,10 @@ SOUND = Survival(
 
 def optimal_line(
     residual: float, gap: float = 0.0, global_check: GlobalCheck | None = None
-) -> v.VerdictLine:
+) -> v.Check:
     kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
     known = v.search_evidence(16, 2, global_check)
-    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", searched=known)
+    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better=BETTER, searched=known)
 
 
 @given(st.floats(0.0, 10.0))
@@ -103,11 +105,12 @@ def test_the_look_at_the_box_is_said() -> None:
 def test_the_ends_of_a_search_are_told_apart(first: float, share: float) -> None:
     """Of a slow loop too, to four digits at least."""
     ends = [first, first * (1.0 - share)]
-    words = multistart_words(ends)
+    words = Reason.MULTISTART(local_optima_hz=ends).words()
     shown = [float(value) for value in re.findall(r"[\d.]+", words)]
     assert shown == pytest.approx(ends, rel=5.1e-4)
     assert shown[0] != shown[1]
-    assert "ended at 0.2402, 0.2391, 0.2352 Hz" in multistart_words([0.24021, 0.23911, 0.23518])
+    three = Reason.MULTISTART(local_optima_hz=[0.24021, 0.23911, 0.23518])
+    assert "ended at 0.2402, 0.2391, 0.2352 Hz" in three.words()
 
 
 REACH = SurvivalOptions().reach
@@ -161,7 +164,8 @@ def test_within_every_bound_is_said_of_what_is_shown_so(value: float) -> None:
     worst = Excess(0, np.zeros(1), value)
     shown = f"{100.0 + 100.0 * math.expm1(value):.6g}"
     wide = SetCertificate(True, 1.0, (), {}, "as the judge allows")
-    for words in (kept_words(worst), robust_dict(wide, 9, worst)["words"]):
+    own = within_words(math.expm1(value), BoxCheckOptions.looseness)
+    for words in (own, robust_dict(wide, 9, worst)["words"]):
         assert ("within every bound" in words) == (float(shown) <= 100.0)
         assert ("exceeded by more than 0.02 %" in words) == (float(shown) > 100.0)
 
@@ -176,7 +180,7 @@ def test_a_differentiator_is_said_to_be_one() -> None:
 
 def predicted(
     error: float, value: float = math.nan, left_out: tuple[float, float] | None = None
-) -> v.VerdictLine:
+) -> v.Check:
     """Of a bandwidth, by a surrogate."""
     quality: Any = SimpleNamespace(at_point=left_out, extrapolates=())
     return v.predicted(error, 1e-3, value, BANDWIDTH, quality)

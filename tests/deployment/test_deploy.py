@@ -24,12 +24,13 @@ from oracles.helpers import (
 from oracles.sampled_simulation import measure_set
 from scipy.linalg import block_diag
 
+from ccd_casadi.analysis.loop_channels import scalar_channels
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment import Timing, pipeline
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.realisation import assemble, scalar_channels
+from ccd_casadi.deployment.realisation import assemble
 from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError

@@ -170,7 +170,9 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
         of_other = replace(run, problem=replace(run.problem, controller=other))
         again = replace(found, judge=_judged(of_other, found))
         assert deployed_line(run, again).state == state, again.levels
-        assert any("3.33 times weighted_level" in words for words in again.levels) == (share < 1.0)
+        assert any("3.33 times weighted_level" in one.words() for one in again.levels) == (
+            share < 1.0
+        )
     wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))
     assert _judged(run, replace(found, realisation=wrong)).passed is False
     for share, passed in ((1.001, True), (0.999, False)):

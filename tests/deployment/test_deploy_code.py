@@ -11,9 +11,9 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
+from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.deployment.deploy_files import Section, sections_of
 from ccd_casadi.deployment.realisation import (
-    LoopChannel,
     Realisation,
     difference_equation,
     in_single,

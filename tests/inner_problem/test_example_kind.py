@@ -19,9 +19,10 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer import ThetaOuter
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.run import OUTERS, solve
-from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
+from ccd_casadi.codesign.verdict import Check, State, search_evidence
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.inner_kind import InnerKind
@@ -133,16 +134,16 @@ class VerifiedRule(Verified):
     def evidence(self, predicted: float) -> dict[str, Any]:
         return {"surrogate_bandwidth_hz": predicted / HZ}
 
-    def certified_line(self) -> VerdictLine:
+    def certified_line(self) -> Check:
         state = State.PASSED if self.feasible else State.FAILED
-        return VerdictLine(state, "stable and within S_max and S_low on the model", {})
+        return Check("certified", state, (Reason.JUDGED_ON_MODEL(),), {})
 
-    def gap_words(self) -> str:
-        return ""
+    def better(self) -> Finding:
+        return Reason.QUOTED(words="a better rule of thumb is known")
 
     def searched(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
-    ) -> tuple[str, Mapping[str, Any]]:
+    ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
         return search_evidence(1, 1, global_check)
 
 

@@ -28,7 +28,8 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_p
 from ccd_casadi.inner_problem.structured_problem import (
     StructuredProblem,
     Uncertainty,
-    structured_of,
+    state_of,
+    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import (
@@ -78,7 +79,7 @@ def test_the_price_of_a_tolerance_is_what_another_solve_finds(anchored: CoDesign
             damping=(1.0 - 0.4 * damping, 1.0 + 0.5 * damping),
             gain=0.05 * gain,
         )
-        return with_structured(anchored, uncertainty=own, scenarios=())
+        return with_state(with_structured(anchored, uncertainty=own), scenarios=())
 
     here = structured_value(wider(), theta)
     prices = DesignOnBox(wider(), theta, here.design).tolerance_prices()
@@ -159,8 +160,8 @@ def test_plants_that_refute_a_design_join_the_set(
     """Of a design for the model alone, judged on the box: each plant exceeds a bound with it, the
     next search knows them, and its design keeps them."""
     theta, options = anchored.start, BoxCheckOptions(lattice=24, added=3)
-    scenarios = structured_of(anchored).scenarios
-    alone = with_structured(anchored, scenarios=scenarios[:1])
+    scenarios = state_of(anchored).scenarios
+    alone = with_state(anchored, scenarios=scenarios[:1])
     made = structured_value(alone, theta).design
     on_box = DesignOnBox(alone, theta, made, options)
     worst = on_box.worst()[0]
@@ -181,7 +182,7 @@ def test_plants_that_refute_a_design_join_the_set(
         more = outer.refuted(verified)  # type: ignore[arg-type]
         assert more is not None
         assert more.repairs == outer.repairs + 1  # so that another lattice judges
-        assert structured_of(more.problem).scenarios == (*scenarios[:1], *found)
+        assert state_of(more.problem).scenarios == (*scenarios[:1], *found)
         again = structured_value(more.problem, theta).design
     assert again.certified
     assert again.bandwidth <= made.bandwidth
@@ -233,7 +234,7 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace, None]:
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
-        return with_structured(case, warm_starts=((case.inner.S_max,),)), design, None
+        return with_state(case, warm_starts=((case.inner.S_max,),)), design, None
 
     monkeypatch.setattr(stored_searches, "prepared", raced)
     case = quick(PID)
@@ -242,7 +243,7 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
             required = replace(case, inner=replace(case.inner, S_max=bound))
             of = Sampler(required, store, Workers(1))
             found, words = stored_searches.with_initial_search(of, 0)
-            assert (structured_of(found).warm_starts, words) == (
+            assert (state_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
 
@@ -259,7 +260,7 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
 
     monkeypatch.setattr(structured_bandwidth.ProblemAt, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
-        alone = Sampler(with_structured(anchored, warm_starts=()), store, pool)
+        alone = Sampler(with_state(anchored, warm_starts=()), store, pool)
         first = alone.values(np.array(anchored.start))[0]
         best = pieces_from(alone, first, 1e-3, 0.1)
     assert best.value >= first.value * (1.0 - 1e-6)

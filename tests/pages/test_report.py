@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from oracles.html_document import Document
 
+from ccd_casadi.analysis.loop_channels import scalar_channels
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
@@ -23,7 +24,6 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.deployment.realisation import scalar_channels
 from ccd_casadi.drawing.paint import block_html, draw, page_html, read_pages
 from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant

@@ -385,7 +385,7 @@ def test_a_search_starts_again_from_the_whole_box_where_its_own_controller_is_un
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The fast controller of the model alone is stable on no other machine."""
-    for name in ("with_warm_start", "with_structured"):
+    for name in ("with_warm_start", "with_structured", "with_state"):
         monkeypatch.setattr(share_search, name, lambda problem, *rest, **more: problem)
 
     class Sampler:

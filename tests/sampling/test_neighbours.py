@@ -13,8 +13,15 @@ from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_problem import (
+    SearchState,
+    StructuredProblem,
+    state_of,
+    structured_of,
+    with_state,
+)
 from ccd_casadi.sampling import sampler as module
+from ccd_casadi.sampling.sample_keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -32,7 +39,7 @@ def branches(cliff: float, required: list[tuple]) -> Callable[[tuple], tuple]:
         case, _, key, theta = task
         sections, z = case.controller, (theta[0] - 55.0) / 15.0
         assert isinstance(sections, StructuredProblem)
-        known = {*sections.warm_starts, *sections.error_warm_starts}
+        known = {*sections.state.warm_starts, *sections.state.error_warm_starts}
         kappa = GOOD if GOOD in known or z < cliff else POOR
         value, slope = 250.0 + 10.0 * z, 10.0
         if kappa == GOOD:
@@ -50,7 +57,7 @@ def branches(cliff: float, required: list[tuple]) -> Callable[[tuple], tuple]:
 
 
 def two_branches(**changes: object) -> CoDesignProblem:
-    sections = replace(StructuredProblem(warm_starts=(POOR,)), **changes)  # type: ignore[arg-type]
+    sections = replace(StructuredProblem(state=SearchState(warm_starts=(POOR,))), **changes)  # type: ignore[arg-type]
     return problem(controller=sections, w1=0.0, w2=-1.0 if "minimise" not in changes else 1e6)
 
 
@@ -105,6 +112,37 @@ def test_a_controller_given_for_a_theta_counts_where_it_is_better(
 
 def test_a_design_without_a_controller_is_no_warm_start() -> None:
     """A search at its θ begins from others': an empty κ had ended a run in a traceback."""
-    known = StructuredProblem(warm_starts=(POOR,))
+    known = StructuredProblem(state=SearchState(warm_starts=(POOR,)))
     assert known.with_warm_start((), 3) == known
-    assert known.with_warm_start(GOOD, 3).warm_starts == (GOOD, POOR)
+    assert known.with_warm_start(GOOD, 3).state.warm_starts == (GOOD, POOR)
+
+
+KAPPAS = st.lists(st.tuples(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0)), max_size=3).map(tuple)
+STATES = st.builds(
+    SearchState, KAPPAS, KAPPAS, st.lists(st.tuples(st.integers(0, 2), st.just((0.1,)))).map(tuple),
+    st.integers(0, 9),
+)  # fmt: skip
+
+
+@given(state=STATES, of_error=st.booleans())
+def test_a_search_state_leaves_the_statement_and_has_its_own_key(
+    state: SearchState, of_error: bool
+) -> None:
+    """Old stores keep their samples: a key has the state's values under the names of before."""
+    minimise = "move_time" if of_error else "bandwidth"
+    stated = problem(controller=StructuredProblem(minimise=minimise))
+    found = with_state(stated, **vars(state))
+    assert state_of(found) == state
+    assert with_state(found, **vars(SearchState())) == stated
+    own: dict[str, Any] = {
+        "anchors": state.warm_starts,
+        "members": state.scenarios,
+        "seed": state.seed,
+    }
+    if of_error:
+        own["least_error"] = [0.0, state.error_warm_starts]
+    identity, before = (structured_of(one).identity() for one in (found, stated))
+    assert identity == before | own
+    assert list(identity) == list(before)
+    if identity != before:
+        assert problem_hash(found.identity()) != problem_hash(stated.identity())

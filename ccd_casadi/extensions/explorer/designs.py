@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.problem import (
     scaled_system,
 )
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import structured_of
+from ccd_casadi.inner_problem.structured_problem import state_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
@@ -265,18 +265,17 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     if known is None:
         return problem
     mine, theirs = structured_of(problem), structured_of(known)
-    scenarios = theirs.scenarios if mine.uncertainty == theirs.uncertainty else ()
-    taken = replace(
-        mine, warm_starts=theirs.warm_starts, scenarios=scenarios, channels=theirs.channels,
-        frequencies=theirs.frequencies, seed=theirs.seed,
-    )  # fmt: skip
+    state = theirs.state
+    if mine.uncertainty != theirs.uncertainty:
+        state = replace(state, scenarios=())
+    taken = replace(mine, state=state, channels=theirs.channels, frequencies=theirs.frequencies)
     return replace(problem, controller=taken, start=known.start)
 
 
 def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:
     """The best certified controller at θ from the problem's warm starts, or from many starts."""
     problem, knobs = task
-    if not structured_of(problem).warm_starts:
+    if not state_of(problem).warm_starts:
         problem = prepared(replace(problem, start=knobs.theta), tell=tell)[0]
     problem = with_range(problem)
     designs, inner = hashes_of(problem)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.extensions.limitations.bound import (
     forbids,
     forbids_most,
@@ -58,15 +59,13 @@ class BandwidthGap:
     model_bound: float = 0.0
     limits: tuple[str, ...] = ()
 
-    def words(self, bandwidth: float) -> str:
+    def finding(self, bandwidth: float) -> Finding:
         """Of the verdict, with a design's ω_b in rad/s."""
         if not np.isfinite(self.upper_bound):
-            return "no bound on every controller, gap not known"
-        gap = 100.0 * (self.upper_bound / bandwidth - 1.0)
-        return (
-            f"no controller of any order exceeds {number(self.upper_bound / HZ, 4)} Hz on "
-            f"{self.plants} here (gap at most {gap:.0f} %), gap over theta not known"
-        )
+            return Reason.NO_GAP()
+        gap = self.upper_bound / bandwidth - 1.0
+        bound = self.upper_bound / HZ
+        return Reason.GAP(bandwidth_bound_hz=bound, plants=self.plants, relative=gap)
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
         """Of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1; null: not known.
@@ -82,7 +81,7 @@ class BandwidthGap:
             "channel": self.channel,
             "objective_bound": np.nan,
             "limits": list(self.limits),
-            "words": self.words(bandwidth) if np.isfinite(bandwidth) else "",
+            "words": self.finding(bandwidth).words() if np.isfinite(bandwidth) else "",
         }
         return json_values(found)
 

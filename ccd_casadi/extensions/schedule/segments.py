@@ -22,7 +22,9 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import (
     StructuredProblem,
+    state_of,
     structured_of,
+    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
@@ -135,9 +137,8 @@ def within(problem: CoDesignProblem, name: str, low: float, high: float) -> CoDe
     fixed = tuple((own, middle if own == name else value, unit)
                   for own, value, unit in problem.source.fixed)  # fmt: skip
     found = replace(problem, source=replace(problem.source, fixed=fixed))
-    return with_structured(
-        found, uncertainty=replace(u, ranges=ranges), warm_starts=(), scenarios=()
-    )
+    found = with_structured(found, uncertainty=replace(u, ranges=ranges))
+    return with_state(found, warm_starts=(), scenarios=())
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def designed(
     """The largest bandwidth on a part, from many starts, and from a controller that keeps it."""
     own = replace(problem, start=tuple(theta))
     if warm is not None:
-        own = with_structured(own, warm_starts=(tuple(map(float, warm.kappa)),))
+        own = with_state(own, warm_starts=(tuple(map(float, warm.kappa)),))
     own, made, _ = prepared(own, tell, workers)
     if warm is not None and not made.bandwidth >= warm.bandwidth:
         own, made = problem, warm  # which keeps every bound on the part, too
@@ -286,8 +287,8 @@ def refined(
     row = np.arange(len(own.names)) == own.names.index(f"theta.{name}")
     more = [(option, tuple(np.where(row, p, corner).tolist()))
             for p in positions for option, corner in own.corners()]  # fmt: skip
-    known = structured_of(segment.problem).scenarios
-    problem = with_structured(
+    known = state_of(segment.problem).scenarios
+    problem = with_state(
         segment.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
         warm_starts=(tuple(map(float, segment.design.kappa)),),
     )  # fmt: skip

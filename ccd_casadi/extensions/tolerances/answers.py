@@ -9,9 +9,10 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
+from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.run import within
 from ccd_casadi.codesign.structured_entries import design_dict, sections_controller
-from ccd_casadi.codesign.verdict import State, VerdictLine, deployable
+from ccd_casadi.codesign.verdict import Check, State, deployable
 from ccd_casadi.extensions.tolerances.prices import prices
 from ccd_casadi.extensions.tolerances.share_certificate import ShareCertificate, certified_share
 from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
@@ -20,7 +21,7 @@ from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.plants.plant import hardware_cost
@@ -101,7 +102,7 @@ def design_for_share(
 
     problem, whole, at = sampler.problem, None, theta or of.problem.start
     if theta is not None:
-        fixed = with_structured(replace(problem, start=theta), seed=seed)
+        fixed = with_state(replace(problem, start=theta), seed=seed)
         with within_budget(minutes):
             problem, made, _ = prepared(fixed, tell, sampler.workers)
         whole = made if made.certified else None
@@ -154,7 +155,7 @@ def share_answer(found: ShareDesign) -> Answer:
     else:
         words.append("whole box     no controller was found for it")
     kept = [{"option": option, "point": list(point)}
-            for option, point in structured_of(problem).scenarios]  # fmt: skip
+            for option, point in state_of(problem).scenarios]  # fmt: skip
     entry = {
         "status": "verified" if good else "not_verified",
         "verdict": {"share": line.entry},
@@ -176,9 +177,9 @@ def share_answer(found: ShareDesign) -> Answer:
         "reason": "" if good else words[0], "anchors": [design.kappa.tolist()],
         "robust": {"set": kept}, "seed": search.seed,
         "verdict": {
-            "certified": VerdictLine.of(
-                State.PASSED if design.certified else State.FAILED,
-                (f"{design.words}, on which it was designed",), {},
+            "certified": Check(
+                "certified", State.PASSED if design.certified else State.FAILED,
+                (Reason.DESIGNED_ON(words=design.words),), {},
             ).entry,
             "survives": line.entry,
             "deployable": deployable(None, problem.sampling).entry,

@@ -16,7 +16,12 @@ from ccd_casadi.extensions.tolerances.machines import tolerance_of
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import (
+    Uncertainty,
+    structured_of,
+    with_state,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.support.arrays import Array
@@ -107,7 +112,7 @@ def redesigned(
     """The best from a controller at θ on the worst plants of the problem's own box: the problem at
     θ with these plants, and the design."""
     at = replace(problem, start=tuple(map(float, theta)))
-    at = with_structured(at, warm_starts=(tuple(map(float, kappa)),), scenarios=())
+    at = with_state(at, warm_starts=(tuple(map(float, kappa)),), scenarios=())
     found, made, _ = prepared(at, silent, workers, only_warm_starts=True)
     return found, made
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.tables import RobustTable
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.reasons import Reason
+from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.extensions.tolerances.machines import Machine, Plan, drawn
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.process_pool import Pool, results
@@ -63,15 +64,13 @@ class ShareCertificate:
         return self.least >= self.plan.share
 
     @property
-    def line(self) -> VerdictLine:
+    def line(self) -> Check:
         """Of the verdict. It says nothing of the whole box."""
         plan, state = self.plan, State.PASSED if self.passed else State.FAILED
         claim = RobustTable(share=plan.share, confidence=plan.confidence).share_words
-        words = f"{claim}: " if self.passed else f"not shown {claim}: "
-        words += f"judged on {plan.draws:,} fresh draws, {self.failed} failed"
-        least = f"{int(1e6 * self.least) / 1e4:g} % is shown"  # rounded down
-        clauses = (words, least, f"{plan.allowed} may fail", "the whole box is not judged")
-        return VerdictLine.of(state, clauses, self.entry)
+        shown = (Reason.SHARE_SHOWN if self.passed else Reason.SHARE_NOT_SHOWN)(claim=claim)
+        found = (shown, Reason.SHARE_LEAST(), Reason.MAY_FAIL(), Reason.BOX_NOT_JUDGED())
+        return Check("survives", state, found, self.entry)
 
     @property
     def entry(self) -> dict[str, Any]:

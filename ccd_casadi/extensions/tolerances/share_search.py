@@ -28,7 +28,9 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_o
 from ccd_casadi.inner_problem.structured_problem import (
     Scenario,
     Uncertainty,
+    state_of,
     structured_of,
+    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_search import prepared, with_warm_start
@@ -162,7 +164,7 @@ class ShareSearch:
         """
         search, may = self, self.may_fail(options)
         for _ in range(options.designs):
-            known = structured_of(search.problem).scenarios
+            known = state_of(search.problem).scenarios
             over = [one for one in search.failing() if one not in known]
             may, fewer = max(min(may, len(over) - fewer), 0) if fewer else may, 0
             added = over[may:][: options.added]
@@ -177,7 +179,7 @@ class ShareSearch:
         set has machines that joined when fewer were given up."""
         search, J = self, partial(objective_of, self.problem)
         while not ends_early("design without a machine"):
-            ranked, known = search.ranked(), structured_of(search.problem).scenarios
+            ranked, known = search.ranked(), state_of(search.problem).scenarios
             if sum(value > WorstPlantOptions.within for value in ranked.values()) >= may:
                 break
             binding = [one for one in known if ranked.get(one, -np.inf) > -options.binds]
@@ -194,7 +196,7 @@ class ShareSearch:
     def tell(self, tell: Tell, words: str) -> None:
         """A line of progress."""
         shown = self.problem.figure.shown(self.best.value)
-        tell(f"{shown} on {len(structured_of(self.problem).scenarios)} machines; {words}")
+        tell(f"{shown} on {len(state_of(self.problem).scenarios)} machines; {words}")
 
     def on(self, scenarios: tuple[Scenario, ...]) -> "ShareSearch":
         """The best from its own controller on another working set, at the same θ.
@@ -205,7 +207,7 @@ class ShareSearch:
             None meets the bounds there.
         """
         problem = with_warm_start(self.problem, self.best.kappa)
-        sampler = self.sampler.of(with_structured(problem, scenarios=scenarios))
+        sampler = self.sampler.of(with_state(problem, scenarios=scenarios))
         best = sampler.value_from(self.best.theta, self.best.kappa)
         if not best.feasible and self.whole_box:  # that from the model alone may be unstable there
             best = sampler.value_from(self.best.theta, list(self.whole_box))
@@ -257,18 +259,18 @@ def started(
     problem = sampler.problem
     if kappa is None:
         known = structured_of(problem).uncertainty.options
-        alone = replace(problem, start=theta)
-        alone = with_structured(alone, uncertainty=Uncertainty(options=known), seed=seed)
+        alone = with_state(replace(problem, start=theta), seed=seed)
+        alone = with_structured(alone, uncertainty=Uncertainty(options=known))
         found, made, _ = prepared(alone, tell, sampler.workers)
         if not made.certified:
             raise NoDesign(f"no controller was found for the model alone: {made.words}")
         own, kappa = structured_of(found), made.kappa
-        problem = with_structured(problem, warm_starts=own.warm_starts, channels=own.channels,
-                                  frequencies=own.frequencies)  # fmt: skip
+        problem = with_state(problem, warm_starts=own.state.warm_starts)
+        problem = with_structured(problem, channels=own.channels, frequencies=own.frequencies)
     options = range(1 + len(structured_of(problem).uncertainty.options))
     model = uncertain_plant(problem, theta).nominal
     models = tuple(scenario_of((option, model)) for option in options)
-    own_sampler = sampler.of(with_structured(problem, scenarios=models))
+    own_sampler = sampler.of(with_state(problem, scenarios=models))
     start = own_sampler.value_from(theta, kappa.tolist())
     if not start.feasible:
         raise NoDesign(f"no controller was found for the model alone: {start.shortfall}")
