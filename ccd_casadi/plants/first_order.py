@@ -107,11 +107,15 @@ class FirstOrderPlant:
 
     @property
     def pushed(self) -> Array:
-        """Where forces move the sensors (p, m): at rest, or first, C Aⁿ B, where nothing rests."""
+        """Where forces move the sensors (p, m): a free body and an integrator as they go on, at
+        rest what rests; of what goes away by itself first, C Aⁿ B."""
         A, B, C = self.system.A, self.system.B, self.system.C
-        if not self.at_rest and (self.rates.real < 0.0).all():
-            return -C @ np.linalg.solve(A, B)
-        return self.leading[1]
+        if not (self.rates.real < 0.0).all():
+            return self.leading[1]
+        n, r = self.bodies, self.at_rest
+        if n:
+            return C[:, :n] @ B[n : 2 * n]
+        return C[:, :r] @ B[:r] if r else -C @ np.linalg.solve(A, B)
 
     def suspended(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
         """The same with free bodies held by springs of ω in rad/s, or integrators driven away with
