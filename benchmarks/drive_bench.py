@@ -8,7 +8,7 @@ Each row is one design of examples/drive_bench: Hz before rounding, rounded, and
     the example                           54.4      11.7
     decay 10                              57.8      27.5
     no decay (dampings up to 2)           59.2    5264
-    no decay, filters at ω_b (same)       60.5    3917     a filter at 61 and 65 Hz
+    no decay, filters at ω_b              62.0       -     60.5, 3917 ms with dampings up to 2
     position at 2 kHz                     47.6      13.4   judged by lifting, not proven
     the load's sensor alone               76.3       8.3   97.2 without the rules, by Kv = 13 1/s
     ball screw                            18.5      34.4   only proven to 0.51 %
