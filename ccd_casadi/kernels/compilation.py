@@ -129,7 +129,7 @@ def group_of(module: str) -> str:
 
 def is_compiled(group: str) -> bool:
     """Whether the group's stamp says so."""
-    return _read(_stamp(_folder(_kernels()), group)) == _state()
+    return _read(_stamp(_folder(), group)) == _state()
 
 
 def ensure_compiled(*groups: str, options: CompilationOptions = CompilationOptions()) -> None:
@@ -146,8 +146,7 @@ def ensure_compiled(*groups: str, options: CompilationOptions = CompilationOptio
     groups = groups or tuple(GROUPS)
     if all(map(is_compiled, groups)):
         return
-    kernels = _kernels()
-    folder = _folder(kernels)
+    folder = _folder()
     state = _state()  # before: sources may change meanwhile
     with _alone(folder / "compiled.lock"):
         missing = [group for group in groups if _read(_stamp(folder, group)) != state]
@@ -158,7 +157,7 @@ def ensure_compiled(*groups: str, options: CompilationOptions = CompilationOptio
             min(len(parts), usable_cores()),
             sum(getattr(options, group) for group in missing),
         )
-        kernels = {name: kernel for name, kernel in kernels.items()
+        kernels = {name: kernel for name, kernel in _kernels().items()
                    if group_of(name.rpartition(".")[0]) in ("", *missing)}  # fmt: skip
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
@@ -219,9 +218,9 @@ def _kernels() -> dict[str, Any]:
     return found
 
 
-def _folder(kernels: dict[str, Any]) -> Path:
-    """Where Numba keeps them."""
-    return Path(next(iter(kernels.values())).stats.cache_path)
+def _folder() -> Path:
+    """Where Numba keeps them, as one module says whose import brings no other."""
+    return Path(import_module(f"{PACKAGE}.linear_algebra").schur.stats.cache_path)
 
 
 def _state() -> str:
