@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -75,8 +74,8 @@ def test_no_kernel_returns_a_named_tuple_to_python() -> None:
 @pytest.fixture
 def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A place on disk that holds no kernel; what would compile them says how often it was asked."""
-    kernel = SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path / "place")))
-    monkeypatch.setattr(compilation, "_kernels", lambda: {"one": kernel})
+    monkeypatch.setattr(compilation, "_folder", lambda: tmp_path / "place")
+    monkeypatch.setattr(compilation, "_kernels", dict)
     return tmp_path / "place"
 
 
