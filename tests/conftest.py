@@ -76,7 +76,9 @@ def pictures(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def short_verdicts() -> Iterator[None]:
     """Every line of a verdict that any test makes has 25 words at most, and none had to be cut; as
-    result.json has it, it renders to the same words but of what is not finite."""
+    result.json has it, it renders to the same words but of what is not finite. No figure has the
+    name of what words are derived to."""
+    from ccd_casadi.codesign.reasons import DERIVED
     from ccd_casadi.codesign.verdict import Check
     from ccd_casadi.support.json_files import json_values
 
@@ -94,6 +96,8 @@ def short_verdicts() -> Iterator[None]:
         assert again == self.clauses or not finite, again
         long = [one for one in self.clauses if len(one.split()) > 25 or one.endswith(" ...")]
         assert not long, long
+        named_figures = [self.figures, *(one.figures for one in self.findings)]
+        assert not any(set(figures) & set(DERIVED) for figures in named_figures), self.name
 
     Check.__init__ = checked  # type: ignore[method-assign]
     yield
