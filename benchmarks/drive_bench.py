@@ -77,14 +77,14 @@ def main(names: list[str]) -> None:
     for name in names or [*ROWS]:
         problem, started = drive_problem(case_of(*ROWS[name])), perf_counter()
         try:
-            found = design_drive(problem.cascade, problem.uncertain, problem.bounds,
-                                 problem.sampling)  # fmt: skip
+            parts = problem.cascade, problem.uncertain, problem.bounds, problem.sampling
+            found = design_drive(*parts)
         except UserError as error:
             print(f"{name:26s}{error}", flush=True)
             continue
-        print(f"{name:26s}{found.free.bandwidth / HZ:7.1f} Hz free {found.bandwidth / HZ:7.1f} "
-              f"rounded  {found.status}, {proof_words(found)}  "
-              f"{perf_counter() - started:.0f} s", flush=True)  # fmt: skip
+        hz, seconds = [one.bandwidth / HZ for one in (found.free, found)], perf_counter() - started
+        end = f"{found.status}, {proof_words(found)}  {seconds:.0f} s"
+        print(f"{name:26s}{hz[0]:7.1f} Hz free {hz[1]:7.1f} rounded  {end}", flush=True)
 
 
 if __name__ == "__main__":

@@ -97,12 +97,12 @@ UNITS: dict[SourceKind, dict[str, tuple[float, bool]]] = {
 PATH = ("mass", "damping", "stiffness")
 
 
-_CORNER = checks.Check(
+_CORNER = checks.KeyCheck(
     lambda value: "too many" if len(several(value)) > 2 else checks.one_or_more(value),
     {"type": ["number", "array"]},
 )
 CORNERS = checks.every(_CORNER, "give a list of Hz, or of [Hz, damping ratio], all above 0")
-TABLE_CHECKS: dict[str, checks.Check] = {
+TABLE_CHECKS: dict[str, checks.KeyCheck] = {
     "name": checks.text,
     "unit": checks.text,
     "level": checks.POSITIVE,

@@ -36,7 +36,7 @@ class Fail:
 
 
 @dataclass(frozen=True)
-class Check:
+class KeyCheck:
     """A check, called with a value, and its JSON Schema, which may let more pass."""
 
     test: Test
@@ -47,9 +47,11 @@ class Check:
         return self.test(value)
 
 
-def _good(schema: Mapping[str, Any], good: Callable[[Any], bool], remedy: str) -> Check:
+def _good(schema: Mapping[str, Any], good: Callable[[Any], bool], remedy: str) -> KeyCheck:
     """A check whose message is the value and the remedy."""
-    return Check(lambda value: None if good(value) else f"is {short_repr(value)}; {remedy}", schema)
+    return KeyCheck(
+        lambda value: None if good(value) else f"is {short_repr(value)}; {remedy}", schema
+    )
 
 
 def _list(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> dict[str, Any]:
@@ -62,7 +64,7 @@ def several(value: Any) -> Any:
     return value if isinstance(value, list | tuple) else [value]
 
 
-def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
+def number(low: float, high: float, remedy: str, *, closed: bool = False) -> KeyCheck:
     """Make the check of a number.
 
     Parameters
@@ -76,7 +78,7 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
 
     Returns
     -------
-    Check
+    KeyCheck
     """
 
     def check(value: Any) -> str | None:
@@ -95,10 +97,10 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
         schema["minimum" if closed else "exclusiveMinimum"] = low
     if math.isfinite(high):
         schema["exclusiveMaximum"] = high
-    return Check(check, schema)
+    return KeyCheck(check, schema)
 
 
-def signed(remedy: str) -> Check:
+def signed(remedy: str) -> KeyCheck:
     """A number of either sign, but none that is lost beside others."""
     finite = number(-math.inf, math.inf, remedy)
 
@@ -108,10 +110,10 @@ def signed(remedy: str) -> Check:
             return wrong
         return f"is {value:g}; give a size from {SMALLEST:g} to {LARGEST:g}, in another unit"
 
-    return Check(check, finite.schema)
+    return KeyCheck(check, finite.schema)
 
 
-def count(least: int) -> Check:
+def count(least: int) -> KeyCheck:
     """A whole number, which `true` is not."""
     return _good(
         {"type": "integer", "minimum": least},
@@ -120,7 +122,7 @@ def count(least: int) -> Check:
     )
 
 
-def choice(*names: str) -> Check:
+def choice(*names: str) -> KeyCheck:
     """Make the check of one of some texts.
 
     Parameters
@@ -129,7 +131,7 @@ def choice(*names: str) -> Check:
 
     Returns
     -------
-    Check
+    KeyCheck
     """
     return _good({"enum": list(names)}, names.__contains__, f"choose one of {', '.join(names)}")
 
@@ -150,7 +152,7 @@ tables = _good(
 )
 
 
-def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> Check:
+def every(item: KeyCheck, remedy: str, least: int = 0, most: int | None = None) -> KeyCheck:
     """A list of so many items that all pass a check; `remedy` says what to give."""
 
     def good(value: Any) -> bool:
@@ -215,15 +217,15 @@ direction = _good(
     lambda value: numbers(value) is None and any(value),
     "give a list of numbers, one for each, that are not all 0",
 )
-listed = Check(numbers.test, _list(ANY.schema, 2))
+listed = KeyCheck(numbers.test, _list(ANY.schema, 2))
 named = _good({"type": "string", "minLength": 1}, lambda v: bool(v) and isinstance(v, str), "")
-_named_or_table = Check(
+_named_or_table = KeyCheck(
     lambda value: None if isinstance(value, Mapping) else named(value),
     {"type": ["string", "object"], "minLength": 1},
 )
 plant_options = every(_named_or_table, "give a list of file names in quotes, or of tables")
-names = every(Check(text.test, named.schema), "give a list of texts in quotes", 1)
-coordinate = Check(
+names = every(KeyCheck(text.test, named.schema), "give a list of texts in quotes", 1)
+coordinate = KeyCheck(
     lambda value: (
         None if isinstance(value, str) and value.removeprefix("-").isidentifier() else ANY(value)
     ),
@@ -236,16 +238,16 @@ names_of_theta = every(named, "give a list of names of [theta] in quotes")
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
-def by_name(item: Check) -> Check:
+def by_name(item: KeyCheck) -> KeyCheck:
     """Make the check of a table whose values all pass a check.
 
     Parameters
     ----------
-    item : Check
+    item : KeyCheck
 
     Returns
     -------
-    Check
+    KeyCheck
     """
 
     def check(value: Any) -> str | None:
@@ -254,10 +256,10 @@ def by_name(item: Check) -> Check:
         wrong = ((name, item(each)) for name, each in value.items())
         return next((f"{name} {words}" for name, words in wrong if words is not None), None)
 
-    return Check(check, {"type": "object", "additionalProperties": dict(item.schema)})
+    return KeyCheck(check, {"type": "object", "additionalProperties": dict(item.schema)})
 
 
-def rows(width: int) -> Check:
+def rows(width: int) -> KeyCheck:
     """Make the check of a list of rows of numbers.
 
     Parameters
@@ -267,7 +269,7 @@ def rows(width: int) -> Check:
 
     Returns
     -------
-    Check
+    KeyCheck
     """
     return every(every(ANY, "", width, width), f"give a list of rows of {width} numbers")
 
@@ -278,7 +280,7 @@ def _text_or_rows(value: Any) -> str | None:
     return None if isinstance(value, str) else rows(width)(value)
 
 
-text_or_rows = Check(
+text_or_rows = KeyCheck(
     _text_or_rows, {"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]}
 )
 
@@ -294,7 +296,7 @@ SUFFIXES = {"_hz": "Hz", "_us": "µs", "_ms": "ms"}
 
 
 def key(
-    says: str, default: Any = MISSING, *, check: Check | None = None, unit: str = "",
+    says: str, default: Any = MISSING, *, check: KeyCheck | None = None, unit: str = "",
     idle: Any = None,
 ) -> Any:  # fmt: skip
     """The field of a table's dataclass that a key is; `check` where its type has another one.
@@ -307,7 +309,7 @@ def key(
     return field(default=default, metadata=metadata)
 
 
-def check_of(item: Field[Any]) -> Check:
+def check_of(item: Field[Any]) -> KeyCheck:
     """Its own, or the usual one of its type: a number above 0, a count, true or false, a text."""
     kind: Any = (*get_args(item.type), item.type)[0]
     return item.metadata["check"] or USUAL[kind]

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 from ccd_casadi.cases.findings import (
-    Finding,
+    CaseFinding,
     Severity,
     Topic,
     entry_findings,
@@ -92,7 +92,7 @@ def diagnose(
     seed: int = 0,
     *,
     options: DiagnosisOptions = DiagnosisOptions(),
-) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
+) -> tuple[tuple[PlantFacts, ...], tuple[CaseFinding, ...]]:
     """Check the plant of a problem over its box.
 
     The plant is checked at `points_to_check`, where parameters that vary belong to θ. Repeated
@@ -111,7 +111,7 @@ def diagnose(
     -------
     facts : tuple of PlantFacts
         At the points where the matrices are those of a plant.
-    findings : tuple of Finding
+    findings : tuple of CaseFinding
 
     Raises
     ------
@@ -137,7 +137,7 @@ def diagnose(
                 scaled = scale_plant(without_hidden_rigid_modes(modal), problem.weights.M_K)
             except PlantError as error:
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"
-                findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
+                findings.append(CaseFinding(Severity.ERROR, Topic.MATRICES, words, index))
                 continue
             found = facts_of(theta, modal, scaled)
             doubt = (
@@ -145,7 +145,7 @@ def diagnose(
                 if index < options.with_derivatives
                 else ""
             )
-            here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
+            here = [CaseFinding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
             here += [
                 *_driven_away(found, modal.states is not None, place),
@@ -167,11 +167,11 @@ def diagnose(
             "that is free at one theta and held at another has no derivative between; narrow the "
             "bounds, or hold it everywhere"
         )
-        findings.append(Finding(Severity.WARNING, Topic.RIGID_MODES, words))
+        findings.append(CaseFinding(Severity.WARNING, Topic.RIGID_MODES, words))
     return tuple(facts), tuple(findings)
 
 
-def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[Finding]:
+def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[CaseFinding]:
     """Parameters that change no matrix, cost or constraint, from end to end of their bounds."""
     of_cost = (np.moveaxis(of, -1, 0) for of in hardware_slopes(plant, problem.start))
     slopes = [*system.derivatives, *of_cost]
@@ -191,7 +191,7 @@ def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[F
                 f"theta.{name} changes nothing: neither matrices nor hardware_cost nor a "
                 "constraint depend on it; use it in the plant function, or take it out of the case"
             )
-            found.append(Finding(Severity.WARNING, Topic.UNUSED, words))
+            found.append(CaseFinding(Severity.WARNING, Topic.UNUSED, words))
     return found
 
 
@@ -212,18 +212,18 @@ def suspicions(problem: CoDesignProblem, rigid_modes: int | None = None) -> list
     return [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
 
 
-def first_seen(findings: Sequence[Finding]) -> list[Finding]:
+def first_seen(findings: Sequence[CaseFinding]) -> list[CaseFinding]:
     """Select the findings at the first θ where their topic occurs.
 
     A finding at one θ mostly holds, with other numbers, at the others, too.
 
     Parameters
     ----------
-    findings : sequence of Finding
+    findings : sequence of CaseFinding
 
     Returns
     -------
-    list of Finding
+    list of CaseFinding
         The serious ones first.
     """
     first: dict[tuple[Topic, Severity], int] = {}
@@ -233,9 +233,9 @@ def first_seen(findings: Sequence[Finding]) -> list[Finding]:
     return sorted(kept, key=lambda item: list(Severity).index(item.severity))
 
 
-def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
+def _outside(problem: CoDesignProblem, plant: Plant) -> list[CaseFinding]:
     unknown = plant.unknown_between
-    found = [Finding(Severity.ERROR, Topic.BETWEEN, unknown)] if unknown else []
+    found = [CaseFinding(Severity.ERROR, Topic.BETWEEN, unknown)] if unknown else []
     if plant.domain is None:
         return found
     box = zip(problem.names, problem.lower, problem.upper, *plant.domain, strict=True)
@@ -246,11 +246,11 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
                 f"theta.{name}: its bounds {low:g} to {high:g} go beyond the model's samples, "
                 f"{least:g} to {most:g}; narrow them, or add samples"
             )
-            found.append(Finding(Severity.ERROR, Topic.DOMAIN, words))
+            found.append(CaseFinding(Severity.ERROR, Topic.DOMAIN, words))
     return found
 
 
-def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Finding]:
+def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[CaseFinding]:
     """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
     D = np.abs(modal.D - np.diag(np.diag(modal.D)))
     coupled = (options.coupled * np.diag(modal.D).max() < D).any(axis=1)
@@ -283,7 +283,7 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
                 f"a motion that the stiffness drives away {place} is {missing}: no controller "
                 "stabilises it; add an actuator that moves it and a sensor that sees it"
             )
-            found.append(Finding(Severity.ERROR, Topic.HIDDEN_MODE, words))
+            found.append(CaseFinding(Severity.ERROR, Topic.HIDDEN_MODE, words))
             continue
         else:
             formal = {"driven": "uncontrollable", "measured": "unobservable"}
@@ -292,11 +292,11 @@ def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Fi
                 f"({', '.join(formal[name] for name in lacks)}): no controller damps it, and S "
                 "does not show it"
             )
-        found.append(Finding(Severity.WARNING, Topic.HIDDEN_MODE, words))
+        found.append(CaseFinding(Severity.WARNING, Topic.HIDDEN_MODE, words))
     return found
 
 
-def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[Finding]:
+def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[CaseFinding]:
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if not growth:
         return []
@@ -308,12 +308,12 @@ def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[Finding
         f"{what} {place}: an unstable pole at +{growth:.4g} Hz, which "
         f"the loop has to be faster than; if {meant}"
     )
-    return [Finding(Severity.NOTE, Topic.UNSTABLE, words)]
+    return [CaseFinding(Severity.NOTE, Topic.UNSTABLE, words)]
 
 
 def _rigid(
     modal: ModalPlant, suspension: Suspension, expected: int | None, place: str
-) -> list[Finding]:
+) -> list[CaseFinding]:
     count = int(modal.rigid.sum())
     flexible = modal.natural[~modal.rigid & ~modal.driven_away] / HZ
     least = f"; the lowest frequency is {flexible[0]:.4g} Hz" if flexible.size else ""
@@ -323,12 +323,12 @@ def _rigid(
             f"{expected}{least}; correct the stiffness (K v = 0 for a rigid-body motion v), or "
             "suspension.rigid_modes"
         )
-        return [Finding(Severity.ERROR, Topic.RIGID_MODES, words)]
+        return [CaseFinding(Severity.ERROR, Topic.RIGID_MODES, words)]
     slow = flexible[flexible < 10.0 * suspension.frequency_hz]
     if count and slow.size:
         words = (
             f"a flexible mode at {slow[0]:.3g} Hz {place} lies next to the suspension's "
             f"{suspension.frequency_hz:g} Hz: is it a rigid-body mode that K holds by mistake?"
         )
-        return [Finding(Severity.WARNING, Topic.RIGID_MODES, words)]
+        return [CaseFinding(Severity.WARNING, Topic.RIGID_MODES, words)]
     return []

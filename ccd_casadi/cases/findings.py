@@ -90,7 +90,7 @@ class Topic(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class CaseFinding:
     """One sentence about the plant; `index` of the θ where it was seen, among those looked at.
 
     `limit_hz`: the bandwidth above which none is possible there.
@@ -105,7 +105,7 @@ class Finding:
 
 def zero_findings(
     facts: PlantFacts, S_max: float, place: str, *, options: FindingOptions = FindingOptions()
-) -> list[Finding]:
+) -> list[CaseFinding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
     right = [zero for zero in facts.zeros if zero.damping_ratio < 0.0]
@@ -116,7 +116,7 @@ def zero_findings(
     ]
 
 
-def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
+def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> CaseFinding:
     z, limit = zero.frequency_hz, bandwidth_limit_hz(zero, S_max)
     words = (
         f"a transmission zero in the right half-plane at {z:.4g} Hz {place}: with a peak of S of "
@@ -125,20 +125,20 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
         "actuator closer together"
     )
     severity = Severity.WARNING if z < 2.0 * facts.effort_hz else Severity.NOTE
-    return Finding(severity, Topic.ZERO, words, limit_hz=limit)
+    return CaseFinding(severity, Topic.ZERO, words, limit_hz=limit)
 
 
-def _dip(zero: Zero, place: str) -> Finding:
+def _dip(zero: Zero, place: str) -> CaseFinding:
     z = zero.frequency_hz
     words = (
         f"an anti-resonance (transmission zero) at {z:.4g} Hz {place}, damping "
         f"{100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through it needs "
         f"{1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
     )
-    return Finding(Severity.NOTE, Topic.ZERO, words)
+    return CaseFinding(Severity.NOTE, Topic.ZERO, words)
 
 
-def most_limiting(findings: Sequence[Finding]) -> list[Finding]:
+def most_limiting(findings: Sequence[CaseFinding]) -> list[CaseFinding]:
     """All findings, of the right half-plane warnings only that with the lowest limit."""
     severe = [f for f in findings if f.severity is Severity.WARNING and f.limit_hz < np.inf]
     worst = min(severe, key=lambda f: f.limit_hz, default=None)
@@ -151,14 +151,14 @@ def unit_findings(
     plant: ScaledPlant,
     *,
     options: FindingOptions = FindingOptions(),
-) -> list[Finding]:
+) -> list[CaseFinding]:
     """Warnings about M_K, the resonances and S_max, from the plant at the start."""
     words = [
         *_effort(problem, facts, plant, options),
         *(_resonances(problem, facts, options) if states_effort(problem) else []),
         *peak_words(problem.inner.S_max, options=options),
     ]
-    return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
+    return [CaseFinding(Severity.WARNING, Topic.UNITS, item) for item in words]
 
 
 def loop_findings(
@@ -167,7 +167,7 @@ def loop_findings(
     modal: ModalPlant,
     *,
     options: FindingOptions = FindingOptions(),
-) -> list[Finding]:
+) -> list[CaseFinding]:
     """Warnings about signs of sensors and actuators, and about the delay and the rate of the
     loop."""
     words = _sign_words(problem, modal) + _unit_words(problem, modal, options)
@@ -176,7 +176,7 @@ def loop_findings(
         meant = facts.effort_hz if states_effort(problem) else np.nan
         words += _lag_words(run, meant, options)
         words += _unstable_words(run, growth, problem.inner.S_max)
-    return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
+    return [CaseFinding(Severity.WARNING, Topic.LOOP, item) for item in words]
 
 
 def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
@@ -292,7 +292,7 @@ def _unstable_words(run: Sampling, growth_hz: float, S_max: float) -> list[str]:
     ]
 
 
-def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:
+def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[CaseFinding]:
     """Warnings of a θ in a unit of mass or stiffness that stands in the matrix in that unit.
 
     The entries' slopes tell: of a mass in g that is told in kg they are 0.001.
@@ -314,7 +314,7 @@ def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]
                 f"theta.{name} is in {unit}, and {key} grows by {entries[0]:.4g} with each, where "
                 f"{units[unit]:g} is meant: is the matrix in another unit? {SI}"
             )
-            found.append(Finding(Severity.WARNING, Topic.UNITS, words))
+            found.append(CaseFinding(Severity.WARNING, Topic.UNITS, words))
     return found
 
 

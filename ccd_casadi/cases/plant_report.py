@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.diagnosis import first_seen
-from ccd_casadi.cases.findings import Finding
+from ccd_casadi.cases.findings import CaseFinding
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import constraint_values
@@ -37,7 +37,7 @@ def plant_report(
     case: Case,
     problem: CoDesignProblem,
     facts: Sequence[PlantFacts],
-    findings: Sequence[Finding],
+    findings: Sequence[CaseFinding],
     *,
     options: PlantReportOptions = PlantReportOptions(),
 ) -> dict[str, Any]:

@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases import checks
-from ccd_casadi.cases.checks import Check, Fail, short_repr
+from ccd_casadi.cases.checks import Fail, KeyCheck, short_repr
 from ccd_casadi.cases.tables import Parameter, PlantTable
 from ccd_casadi.plants.registry import model_named, model_names
 from ccd_casadi.support import extensions
 
 MEASURED = "measured"  # the model of `measured_case`, which has no θ
 # Checks of a model's options that its builder's annotations do not say, by their names.
-_OPTIONS: dict[str, Check] = {
+_OPTIONS: dict[str, KeyCheck] = {
     "zeta": checks.FRACTION,
     "poisson": checks.number(0.0, 0.5, "give a number between 0 and 0.5"),
     "modes": checks.count(1),
 }
 
 # Every key of a [theta.NAME], what is asked of it, and what it says.
-KEYS: dict[str, tuple[Check, str]] = {
+KEYS: dict[str, tuple[KeyCheck, str]] = {
     "lower": (checks.ANY, "least value, in `unit`"),
     "upper": (checks.ANY, "largest value"),
     "start": (checks.ANY, "start of searches; default: the middle"),

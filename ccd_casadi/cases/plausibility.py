@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.analysis.motor import Motion
-from ccd_casadi.cases.findings import Finding, FindingOptions, Severity, Topic, states_effort
+from ccd_casadi.cases.findings import CaseFinding, FindingOptions, Severity, Topic, states_effort
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.plants.plant_facts import PlantFacts
@@ -66,7 +66,7 @@ def plausibility_findings(
     facts: PlantFacts,
     *,
     options: PlausibilityOptions = PlausibilityOptions(),
-) -> list[Finding]:
+) -> list[CaseFinding]:
     """Ask about a motor, a move and S_low of a problem that hardly any machine has.
 
     Parameters
@@ -78,14 +78,14 @@ def plausibility_findings(
 
     Returns
     -------
-    list of Finding
+    list of CaseFinding
         Warnings.
     """
     words = _low_words(problem, facts, options)
     if (motion := problem.source.motion) is not None:
         words += [*_motor_words(problem, motion, facts, options)]
         words += [*_move_words(problem, motion, options)]
-    return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
+    return [CaseFinding(Severity.WARNING, Topic.UNITS, item) for item in words]
 
 
 def _motor_words(

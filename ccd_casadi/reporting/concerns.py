@@ -11,7 +11,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.support.text import inwards, spoken, with_unit
 
 
-class Reason(StrEnum):
+class ConcernKind(StrEnum):
     """Why a decision is not an unconditional yes."""
 
     LINE_FAILED = "line_failed"
@@ -35,7 +35,7 @@ class Reason(StrEnum):
 class Concern:
     """A reason, in words for this design."""
 
-    reason: Reason
+    reason: ConcernKind
     words: str
 
 
@@ -184,7 +184,7 @@ def loop_concerns(
             late = f"only after {with_unit(1e-3 * settled, 's')}"
             found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
     own, warned = (
-        [Concern(Reason.LOOP, words) for words in each]
+        [Concern(ConcernKind.LOOP, words) for words in each]
         for each in (found, result.get("loop_warnings", ()))
     )
     return [*own, *line_concern(result, options), *current_concern(result), *warned]
@@ -211,7 +211,7 @@ def line_concern(
     where = result.get("sensitivity_peak_between_lines_hz")
     at = "" if where is None else f" about {where:.4g} Hz"
     words = f"|S| may reach {reach:.3g} between two lines{at}"
-    return [Concern(Reason.BETWEEN_LINES, words)]
+    return [Concern(ConcernKind.BETWEEN_LINES, words)]
 
 
 def current_concern(
@@ -235,4 +235,4 @@ def current_concern(
         return []
     most = move["needed_current"] / share
     words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
-    return [Concern(Reason.CURRENT, f"{words}, and peak_current is {most:.4g} A")]
+    return [Concern(ConcernKind.CURRENT, f"{words}, and peak_current is {most:.4g} A")]

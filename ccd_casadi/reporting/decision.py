@@ -14,7 +14,7 @@ from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions, clauses_o
 from ccd_casadi.drawing.content import VerdictRow
 from ccd_casadi.reporting.concerns import (
     Concern,
-    Reason,
+    ConcernKind,
     limited_move,
     limited_move_remedy,
     loop_concerns,
@@ -187,19 +187,19 @@ def decide(result: Mapping[str, Any]) -> Decision:
         return _decide_loop(result)
     failed = [name for name, state in states.items() if state == State.FAILED]
     move = limited_move(result)
-    beside = (Concern(Reason.MOVE, move),) if move else ()
+    beside = (Concern(ConcernKind.MOVE, move),) if move else ()
     if failed or result.get("status") != "verified":
-        why = Concern(Reason.NOT_VERIFIED, "it is not verified")
+        why = Concern(ConcernKind.NOT_VERIFIED, "it is not verified")
         if failed:
-            why = Concern(Reason.LINE_FAILED, f"{' and '.join(failed)} failed")
+            why = Concern(ConcernKind.LINE_FAILED, f"{' and '.join(failed)} failed")
         step = _next_of_failed(failed[0], result) if failed else "see why"
         return Decision(Build.NO, (why,), (step,), beside)
     if states.get("certified") == State.UNKNOWN:
-        why = Concern(Reason.LINE_UNKNOWN, "whether it is certified is not known")
+        why = Concern(ConcernKind.LINE_UNKNOWN, "whether it is certified is not known")
         return Decision(Build.NOT_YET, (why,), (NEXT["certified"],), beside)
     survival = _survival_concerns(result, states.get("survives"))
-    against = {Reason.SMALL_ERRORS: Build.NO, Reason.MODEL_ALONE: Build.NOT_YET,
-               Reason.SURVIVAL_UNKNOWN: Build.NOT_YET}  # fmt: skip
+    against = {ConcernKind.SMALL_ERRORS: Build.NO, ConcernKind.MODEL_ALONE: Build.NOT_YET,
+               ConcernKind.SURVIVAL_UNKNOWN: Build.NOT_YET}  # fmt: skip
     for concern in survival:
         if concern.reason in against:
             step = _next_of_survival(result["verdict"]["survives"])
@@ -207,28 +207,33 @@ def decide(result: Mapping[str, Any]) -> Decision:
     if move:
         return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
     warned = [
-        Concern(Reason.LINE_WARNED, f"{name} warned")
+        Concern(ConcernKind.LINE_WARNED, f"{name} warned")
         for name, state in states.items()
         if state == State.WARNED and name != "survives"
     ]
-    searched = [one for one in survival if one.reason is Reason.SET_SEARCHED]
-    weighed = [one for one in survival if one.reason is not Reason.SET_SEARCHED]
+    searched = [one for one in survival if one.reason is ConcernKind.SET_SEARCHED]
+    weighed = [one for one in survival if one.reason is not ConcernKind.SET_SEARCHED]
     concerns = [*weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
         words = f"the search was ended by its budget of {budget['minutes']:g} min"
-        concerns.append(Concern(Reason.BUDGET, words))
+        concerns.append(Concern(ConcernKind.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"
-        concerns.append(Concern(Reason.LINE_UNKNOWN, words))
+        concerns.append(Concern(ConcernKind.LINE_UNKNOWN, words))
     concerns += loop_concerns(result)
     unjudged = states.get("deployable") == State.UNKNOWN
     condition = resonance_condition(result)
     if not concerns:
         build = Build.AFTER_DEPLOY if unjudged else Build.YES
         return Decision(build, unjudged=unjudged, condition=condition)
-    remedies = {Reason.SET_UNPROVEN: "unproven", Reason.CURRENT: "current", Reason.LOOP: "loop",
-                Reason.BETWEEN_LINES: "loop", Reason.BUDGET: "budget"}  # fmt: skip
+    remedies = {
+        ConcernKind.SET_UNPROVEN: "unproven",
+        ConcernKind.CURRENT: "current",
+        ConcernKind.LOOP: "loop",
+        ConcernKind.BETWEEN_LINES: "loop",
+        ConcernKind.BUDGET: "budget",
+    }
     present = {one.reason for one in concerns}
     steps = tuple(dict.fromkeys(NEXT[name] for why, name in remedies.items() if why in present))
     return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition)
@@ -258,9 +263,9 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
     if not concerns:
         return Decision(Build.NOTHING)
     step = "a smaller S_max"
-    if all(one.reason is Reason.BETWEEN_LINES for one in concerns):
+    if all(one.reason is ConcernKind.BETWEEN_LINES for one in concerns):
         step = "more lines there, or more averages"
-    if all(one.reason is Reason.CURRENT for one in concerns):
+    if all(one.reason is ConcernKind.CURRENT for one in concerns):
         step = NEXT["current"]
     return Decision(Build.EXAMINE, tuple(concerns), (step,))
 
@@ -271,16 +276,16 @@ def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Con
     if state == State.WARNED:
         if own == OwnSet.UNPROVEN:
             words = "the bounds are not proven on the whole [robust] set"
-            return [Concern(Reason.SET_UNPROVEN, words)]
+            return [Concern(ConcernKind.SET_UNPROVEN, words)]
         if own == OwnSet.KEPT and (doubt := _unstable_controller(result)):
-            return [Concern(Reason.UNSTABLE_CONTROLLER, doubt)]
+            return [Concern(ConcernKind.UNSTABLE_CONTROLLER, doubt)]
         if own == OwnSet.NONE:
-            return [Concern(Reason.MODEL_ALONE, "it was judged on the model alone")]
-        return [Concern(Reason.SMALL_ERRORS, "it does not survive small errors of its model")]
+            return [Concern(ConcernKind.MODEL_ALONE, "it was judged on the model alone")]
+        return [Concern(ConcernKind.SMALL_ERRORS, "it does not survive small errors of its model")]
     if state == State.UNKNOWN:
         if own == OwnSet.SEARCHED:
-            return [Concern(Reason.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
-        return [Concern(Reason.SURVIVAL_UNKNOWN, "what it survives is not known")]
+            return [Concern(ConcernKind.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
+        return [Concern(ConcernKind.SURVIVAL_UNKNOWN, "what it survives is not known")]
     return []
 
 

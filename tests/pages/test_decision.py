@@ -9,7 +9,7 @@ from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.reporting.brief_risks import risks
-from ccd_casadi.reporting.concerns import ConditionOptions, Reason, resonance_condition
+from ccd_casadi.reporting.concerns import ConcernKind, ConditionOptions, resonance_condition
 from ccd_casadi.reporting.decision import NEXT, Build, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
@@ -94,7 +94,7 @@ def test_no_decision_builds_what_failed_or_is_not_known(
     else:
         assert found.concerns
     if found.builds:
-        assert (Reason.BUDGET in reasons) == ended
+        assert (ConcernKind.BUDGET in reasons) == ended
     for one in found.concerns:
         assert one.words in found.words
     assert found.words == advice(result)
