@@ -1,10 +1,6 @@
 """What the set, the second sensor, the drive's forms and the rounding cost on the two-mass bench.
 
-    python benchmarks/drive_bench.py [ROW ...]
-
-Each row is one design of examples/drive_bench: Hz before rounding, rounded, and what is proven.
-
-                                    Hz, rounded   Tn (ms)
+    python benchmarks/drive_bench.py [ROW ...]      Hz, rounded   Tn (ms)
     the example                           54.4      11.7
     decay 10                              57.8      27.5
     no decay, filters at ω_b              62.0       -     60.5, 3917 with dampings up to 2
@@ -73,10 +69,9 @@ def case_of(sensors: str, shift: float, differs: dict[str, Any]) -> Case:
 def main(names: list[str]) -> None:
     """Print a line for each row."""
     for name in names or [*ROWS]:
-        problem, started = drive_problem(case_of(*ROWS[name])), perf_counter()
+        it, started = drive_problem(case_of(*ROWS[name])), perf_counter()
         try:
-            parts = problem.cascade, problem.uncertain, problem.bounds, problem.sampling
-            found = design_drive(*parts)
+            found = design_drive(it.cascade, it.uncertain, it.bounds, it.sampling)
         except UserError as error:
             print(f"{name:26s}{error}", flush=True)
             continue
