@@ -10,7 +10,6 @@ class YieldOptions:
     """Of a yield by random plants."""
 
     confidence: float = 1.0 - 1e-6
-    words: str = "1 - 1e-6"
 
 
 def yield_bound(survived: int, draws: int, confidence: float = YieldOptions().confidence) -> float:
@@ -61,23 +60,33 @@ class Yield:
     ----------
     survived, draws : int
         Of these draws.
+    turns : int
+        Sets of draws in all, these the last: those before changed the design, and each set may be
+        wrong.
     """
 
     survived: int
     draws: int
+    turns: int = 1
 
     @property
     def least(self) -> float:
-        """The share of all that survives, at least, at the confidence of `YieldOptions`."""
+        """The share of all that survives, at least, as one set of draws shows it."""
         return yield_bound(self.survived, self.draws)
+
+    @property
+    def _risk(self) -> float:
+        """That one set of draws is wrong."""
+        return 1.0 - YieldOptions().confidence
 
     @property
     def words(self) -> str:
         """With the share rounded down."""
         percent = int(1e4 * self.least) / 100.0
+        wrong = f"{self.turns * self._risk:.2g}".replace("e-0", "e-")
         return (
             f"{self.survived} of {self.draws} random plants survive, and so do at least "
-            f"{percent:g} % of all (confidence {YieldOptions().words})"
+            f"{percent:g} % of all (confidence 1 - {wrong})"
         )
 
     @property
@@ -85,5 +94,5 @@ class Yield:
         """Of result.json."""
         return {
             "survived": self.survived, "draws": self.draws, "least": self.least,
-            "confidence": YieldOptions().confidence,
+            "confidence": 1.0 - self.turns * self._risk,
         }  # fmt: skip

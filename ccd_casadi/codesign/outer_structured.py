@@ -204,7 +204,7 @@ class StructuredOuter(ThetaOuter):
         problem = sampler.problem
         design = recertified(problem, best.theta, design)  # what a store holds is not relied on
         judging = BoxCheckOptions()
-        judging = replace(judging, lattice_seed=judging.lattice_seed + self.repairs)
+        judging = replace(judging, turn=self.repairs)
         on_box = DesignOnBox(problem, best.theta, design, judging)
         multistart = end.multistart
         if multistart is None and not ends_early("multi-start check"):
@@ -216,10 +216,11 @@ class StructuredOuter(ThetaOuter):
         certificate = partial(theta_kkt, problem, best, sampler, end.inner.envelope, beside)
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
-        def judged() -> "tuple[SetCertificate, int, Proof, Yield | None]":
+        def judged() -> "tuple[SetCertificate, int, Proof, Yield | None, tuple[Scenario, ...]]":
             whole = on_box.judged(worst, sampler.workers)
-            drawn = None if whole[-1].conclusive else on_box.fresh_yield(sampler.workers)
-            return *whole, drawn
+            if whole[-1].conclusive:
+                return *whole, None, ()
+            return *whole, *on_box.fresh_yield(sampler.workers)
 
         judgement = alongside(judged)
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
@@ -234,7 +235,7 @@ class StructuredOuter(ThetaOuter):
             if problem.figure is MOVE_TIME:
                 reported = stated_time(problem, best.theta, design.controller, best.value)
             second = second_on_set(problem, best.theta, design)
-            wide, checked, proof, drawn = judgement()
+            wide, checked, proof, drawn, lost = judgement()
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -260,7 +261,7 @@ class StructuredOuter(ThetaOuter):
             gap=gap,
             reported=reported,
             second=second,
-            counterexamples=on_box.counterexamples(wide, proof, worst),
+            counterexamples=on_box.counterexamples(wide, proof, worst, lost),
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -69,6 +69,9 @@ class BoxCheckOptions:
         With several channels.
     fresh_seed : int
         Added to the problem's, so that no other draw is repeated.
+    turn : int
+        How many designs these checks have refuted before: each is judged on a lattice and on draws
+        of its own.
     """
 
     added: int = 8
@@ -79,6 +82,7 @@ class BoxCheckOptions:
     fresh: int = 3000
     fresh_of_several: int = 300
     fresh_seed: int = 2000
+    turn: int = 0
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,9 @@ class DesignOnBox:
         structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
         if not uncertain.names:
             return list(uncertain.corners()[: 1 + len(structured.uncertainty.options)])
-        points = lattice(uncertain, options.lattice, structured.state.seed + options.lattice_seed)
+        points = lattice(
+            uncertain, options.lattice, structured.state.seed + options.lattice_seed + options.turn
+        )
         known = [(option, np.array(point)) for option, point in structured.state.scenarios]
         return [*points, (worst.option, worst.point), *known]
 
@@ -161,12 +167,12 @@ class DesignOnBox:
         return _judged(self.problem, plants, K, loose, workers), len(points)
 
     def counterexamples(
-        self, wide: SetCertificate, proof: "Proof", worst: Excess
+        self, wide: SetCertificate, proof: "Proof", worst: Excess, lost: Sequence[Scenario] = ()
     ) -> tuple[Scenario, ...]:
-        """Plants of the box by which judge and proof refute the design, the worst first.
+        """Plants of the box by which judge and proof refute the design, the worst first, then those
+        that fresh draws have `lost`.
 
-        Not those that are drawn for the yield: a design that was changed by these makes its
-        statement void.
+        A design that was changed by draws makes their statement void: the next `turn` has others.
         """
         if not self.uncertain.names:
             return ()
@@ -181,21 +187,27 @@ class DesignOnBox:
         found.sort(key=lambda pair: -pair[0])
         if proof.refuted:
             found.insert(0, (np.inf, (proof.option, tuple(map(float, proof.point)))))
-        known = structured.state.scenarios
-        fresh = dict.fromkeys(plant for _, plant in found if plant not in known)
+        known, all_found = structured.state.scenarios, [*(plant for _, plant in found), *lost]
+        fresh = dict.fromkeys(plant for plant in all_found if plant not in known)
         return tuple(fresh)[: self.options.added]
 
-    def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
-        """Judge plants that are drawn uniformly from the box: how many keep every bound and ω_b.
+    def fresh_yield(self, workers: Pool | None = None) -> tuple[Yield | None, tuple[Scenario, ...]]:
+        """Judge plants that are drawn uniformly from the box: how many keep every bound and ω_b,
+        and those that do not.
 
-        Options are equally likely. None where there is no box.
+        Options are equally likely. None where there is no box. Every `turn` has draws of its own,
+        and each may be wrong: the confidence counts all of them.
         """
         structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
         if not uncertain.names or self.design.controller is None:
-            return None
+            return None, ()
         count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
-        rng = np.random.default_rng((structured.state.seed, options.fresh_seed))
-        return Yield(sum(self.kept(uncertain.drawn(rng, count), workers)), count)
+        rng = np.random.default_rng((structured.state.seed, options.fresh_seed + options.turn))
+        points = uncertain.drawn(rng, count)
+        kept = self.kept(points, workers)
+        lost = [(option, tuple(map(float, point))) for (option, point), good
+                in zip(points, kept, strict=True) if not good]  # fmt: skip
+        return Yield(sum(kept), count, 1 + options.turn), tuple(lost)
 
     def kept(self, points: Sequence[tuple[int, Array]], workers: Pool | None = None) -> list[bool]:
         """Which plants (option, point) keep every bound and ω_b, by the judge, to `looseness`."""

@@ -152,7 +152,7 @@ class StructuredBaseline(Baseline):
         worst = on_box.worst()[0]
         wide, checked, proof = on_box.judged(worst, workers)
         found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
-        drawn = None if proof.conclusive else on_box.fresh_yield(workers)
+        drawn = None if proof.conclusive else on_box.fresh_yield(workers)[0]
         along = found is not None and found.within(*kind_of(self.problem).common_shifts())
         own = box_findings(wide, checked, proof, worst, drawn, along=along)
         return K, survives(found, S_max=self.problem.inner.S_max, **own)

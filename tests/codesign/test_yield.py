@@ -47,3 +47,12 @@ def test_words_round_the_share_down() -> None:
 def test_more_survivors_than_draws_are_refused(survived: int, draws: int) -> None:
     with pytest.raises(ValueError, match="draws survived"):
         yield_bound(survived, draws)
+
+
+def test_a_design_that_draws_have_changed_counts_every_set_of_them() -> None:
+    """Each may be wrong with 1e-6: the share is that of the last, the confidence that of all."""
+    first, third = Yield(3000, 3000), Yield(3000, 3000, 3)
+    assert third.least == first.least
+    assert "confidence 1 - 1e-6)" in first.words
+    assert "confidence 1 - 3e-6)" in third.words
+    assert 1.0 - third.entry["confidence"] == pytest.approx(3e-6)

@@ -171,6 +171,12 @@ def test_plants_that_refute_a_design_join_the_set(
     assert not wide.passed
     assert 1 <= len(found) <= options.added
     assert not set(found) & set(scenarios[:1])
+    drawn = (0, tuple(0.5 * end for end in found[0][1]))  # by the fresh draws of the yield
+    room = DesignOnBox(alone, theta, made, replace(options, added=100))
+    proven = Proof(ProofOutcome.PROVEN, 0.0, ())
+    ways = ((), (drawn, found[0]))
+    every, more = (room.counterexamples(wide, proven, worst, lost) for lost in ways)
+    assert more == (*every, drawn)
     uncertain = uncertain_plant(alone, theta)
     for option, point in found:
         plants = uncertain.as_written([(option, np.array(point))])

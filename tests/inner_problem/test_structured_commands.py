@@ -148,8 +148,9 @@ def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(folder: Path
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn = DesignOnBox(run.problem, run.theta, made, options).fresh_yield()
+        drawn, lost = DesignOnBox(run.problem, run.theta, made, options).fresh_yield()
         assert drawn is not None
+        assert len(lost) == 40 - survived
         assert (drawn.survived, drawn.draws) == (survived, 40)
 
 
