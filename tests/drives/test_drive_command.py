@@ -68,6 +68,7 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     assert "p1417" in sheet
     assert "500" in sheet
     page = (out / "report.html").read_text("utf-8")
+    assert "|S| is below -3 dB up to" in page  # where the shape binds, |S| crosses -3 dB later
     for row in answer["parameters"]:  # each block of the diagram, as the drive names and writes it
         assert f"{row['number']} {row['name'].split(', ')[-1]}".strip() in page
         assert f">{row['value']:.10g}<" in page

@@ -122,7 +122,8 @@ def drive_page(
     head = c.Head(
         f"{own.title}: {title}", "good" if design.status == "verified" else "bad",
         design.status.replace("_", " "), "", design.certificate.words,
-        f"{number(design.bandwidth / HZ, 4)} Hz at -3 dB of S. Proof: {proof_words(design)}",
+        f"|S| is below -3 dB up to {number(design.bandwidth / HZ, 4)} Hz. "
+        f"Proof: {proof_words(design)}",
     )  # fmt: skip
     notes = tuple(f"Chosen: {words}" for words in own.chosen)
     notes += tuple(f"Not known: {words}" for words in own.unknown)
