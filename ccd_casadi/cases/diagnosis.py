@@ -306,7 +306,7 @@ def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[CaseFin
         what, meant = "A drives a motion away", "that is not meant, correct its signs"
     words = (
         f"{what} {place}: an unstable pole at +{growth:.4g} Hz, which "
-        f"the loop has to be faster than; if {meant}"
+        f"the crossover has to exceed; if {meant}"
     )
     return [CaseFinding(Severity.NOTE, Topic.UNSTABLE, words)]
 

@@ -46,6 +46,8 @@ class FindingOptions:
     unlike : float
         Factor between the motions of two sensors of one actuator beyond which a bound on KS counts
         the noise of one of them alone: their units differ.
+    blind : float
+        Share of the gain that a zero leaves, below which it is rounding.
     """
 
     light: float = 0.3
@@ -56,6 +58,7 @@ class FindingOptions:
     most_delay: float = 100.0
     decibel: float = 3.0
     unlike: float = 30.0
+    blind: float = 1e-9
 
 
 # in SI, by how a person writes them
@@ -129,12 +132,14 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> CaseFindi
 
 
 def _dip(zero: Zero, place: str) -> CaseFinding:
-    z = zero.frequency_hz
-    words = (
-        f"an anti-resonance (transmission zero) at {z:.4g} Hz {place}, damping "
-        f"{100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through it needs "
-        f"{1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
-    )
+    words = f"an anti-resonance (transmission zero) at {zero.frequency_hz:.4g} Hz {place}, "
+    if zero.dip < FindingOptions.blind:
+        words += "undamped, caps the bandwidth there: no force moves the sensor at it"
+    else:
+        words += (
+            f"damping {100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through "
+            f"it needs {1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
+        )
     return CaseFinding(Severity.NOTE, Topic.ZERO, words)
 
 

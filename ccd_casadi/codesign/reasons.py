@@ -158,7 +158,7 @@ class Reason(Enum):
         "damping x {damping:.3g}"
     )
     MODEL_ALONE = "judged on the model alone: [robust] names no plant"
-    SET_WITHIN = "{within} on the [robust] set: {proof_state}"
+    SET_WITHIN = "{within} on the [robust] set: {proof_of_set}"
     TRIED_WITHIN = "{within} on {plants:count plant} of the [robust] set"
     JUDGED_ON = "judged on {plants:count plant} of the [robust] set"
     ON_PLANTS = "on {plants:count plant} of the [robust] set"
@@ -364,7 +364,7 @@ DERIVED: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "checked_at": _checked_at,
     "evidence_words": lambda known: Reason[known["evidence"].upper()]().words(known),
     "own_shown": lambda known: FIGURES[known["merit"]].shown(known["own"]),
-    "proof_state": lambda known: PROVEN[known["set"]],
+    "proof_of_set": lambda known: PROVEN[known["set"]],
     "S_max_range": lambda known: _range(known, "S_max_shift"),
     "sides": _sides,
     "stable_range": lambda known: _range(known, "stable_shift"),

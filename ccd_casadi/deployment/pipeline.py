@@ -169,7 +169,7 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     return tuple(found)
 
 
-SHORTEN_IT = "shorten it"
+SHORTEN_IT = "shorten it with --delay (default: one period), or design wider margins"
 DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
 
 

@@ -382,7 +382,8 @@ def _damping_ratio(value: Any) -> float | None:
         what = f"damping_ratio is a {type(value).__name__}"
         raise PlantError(f"{what}; give one number {words}, or damping, a matrix") from None
     if not 0.0 < ratio < 1.0:
-        raise PlantError(f"damping_ratio is {value}; give a number {words}")
+        of_none = ", or damping, a matrix of zeros" if ratio == 0.0 else ""
+        raise PlantError(f"damping_ratio is {value}; give a number {words}{of_none}")
     return ratio
 
 

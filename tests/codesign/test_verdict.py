@@ -422,3 +422,10 @@ def test_every_place_shows_the_same_lines() -> None:
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
     assert decision.lines_of(damage) == ()
     assert block_html(Verdict(decision.lines_of(damage))) == ""
+
+
+def test_the_words_of_a_set_name_its_evidence_beside_the_levels_that_a_proof_left() -> None:
+    """`proven` of an entry is a table of levels; the sentence says `searched`, not that table."""
+    for own, evidence in (("searched", "searched, not proven"), ("kept", "proven")):
+        known = {"set": own, "proven": {}, "worst_excess": -0.1, "looseness": 1e-4}
+        assert Reason.SET_WITHIN().words(known).endswith(f"set: {evidence}")

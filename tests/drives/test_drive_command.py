@@ -57,6 +57,10 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     case = tmp_path / "case.toml"
     case.write_text(text, "utf-8")
     out = tmp_path / "run"
+    strange = tmp_path / "strange.toml"
+    strange.write_text("p1417 = 500\nKp = 12\n", "utf-8")
+    assert main([str(case), "--today", str(strange), "--out", str(out)]) == 2
+    assert "Kp is no parameter of this drive: " in capsys.readouterr().err
     code = main([str(case), "--starts", "1", "--today", str(today), "--out", str(out)])
     answer = json.loads((out / "drive.json").read_text())
     assert code == (0 if answer["status"] == "verified" else 4)

@@ -54,6 +54,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     if theta is not None and options.codesign:
         raise UserError("--theta fixes what --codesign searches; give one of both")
     problem = drive_problem(case, theta)
+    known = [(one.number, one.name) for one in problem.cascade.settings]
+    if strange := [name for name in today or {} if not any(name in pair for pair in known)]:
+        own = ", ".join(number or name for number, name in known)
+        raise UserError(f"{options.today}: {strange[0]} is no parameter of this drive: {own}")
     folder = run_folder(options.case, options.out)
     numbers = DriveOptions(search=replace(DriveOptions().search, starts=options.starts))
     near = None
