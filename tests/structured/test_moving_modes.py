@@ -16,9 +16,10 @@ from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.plants.plant import build_plant, mechanics
+from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
 
 STROKE = (-0.25, 0.3)
 STRUCTURE = Structure(biquads=0)
@@ -175,3 +176,24 @@ def test_what_is_not_enclosed_is_named() -> None:
     assert prove(replace(BOX, options=(two,)), STRUCTURE, KAPPA, 1.0, BARE, LATE).outcome in (
         ProofOutcome.VARIES, ProofOutcome.NOT_SQUARE,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [3, 6, 7, 11, 15, 16])
+def test_corners_of_many_parameters_are_few_and_each_pair_meets_at_all_its_ends(count: int) -> None:
+    """Up to six parameters have every corner. The lines of a lattice stay as many as required."""
+    ranges = tuple((f"x{i}", 1.0 + i, 2.0 + i, 3.0 + i) for i in range(count))
+    none = tuple(np.zeros((0, *shape)) for shape in ((1, 1), (1, 1), (1, 1), (1, 1), (1, 1)))
+    one = np.ones((1, 1))
+    body = Mechanics(one, 0.01 * one, one, one, one, None, none)
+    box = UncertainPlant((body,), 1e5, ranges=ranges)
+    corners = np.array([point for _, point in box.corners()[1:]])
+    low, high = box.box
+    assert len(corners) == (2**count if count <= 6 else 2 << count.bit_length())
+    assert ((corners == low) | (corners == high)).all()
+    ends = corners == high
+    for i in range(count):
+        for j in range(i):
+            met, times = np.unique(ends[:, [i, j]], axis=0, return_counts=True)
+            assert len(met) == 4
+            assert len(set(times.tolist())) == 1
+    assert len(lattice(box, 10, 0, on_lines=2000)) <= 1 + len(corners) + 10 + max(2000, count * 61)
