@@ -126,7 +126,8 @@ def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> 
             values[f"biquad {i + 1} {far}"] = middle * np.exp(rng.normal(0.1, 0.4))
             values[f"biquad {i + 1} {far} damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
         found.append(_kappa(problem, values))
-    return with_crossover(problem, np.array(found), crossovers)
+    kappa = np.reshape(found, (-1, len(problem.structure.names)))  # of no crossover too
+    return with_crossover(problem, kappa, crossovers)
 
 
 def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.Generator) -> Array:

@@ -29,7 +29,7 @@ from ccd_casadi.fixed_structure.channel_structure import (
     given_decoupling,
 )
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.design import SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign, SectionsOutcome
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.plant_set import plant_set
@@ -334,3 +334,13 @@ def test_bounds_that_are_no_tighter_are_refused() -> None:
         replace(FREE, channels=channel_bounds(AXES, {"a": {"M_K": 1.0}}))
     with pytest.raises(ValueError, match="that of the weights"):
         replace(BOUNDS, channels=channel_bounds(AXES, {"a": {"M_K": 2.0 * M_K}}))
+
+
+def test_a_known_controller_that_no_plant_takes_is_a_failure_and_no_error() -> None:
+    """Where nothing but known controllers is to be tried there are no starts to draw."""
+    wanted = [plant(off=x) for x in (0.3, 0.2)]
+    whole = structure(LIGHT)
+    unstable = np.full(len(whole.names), 3.0)
+    made = synthesise(wanted, whole, BOUNDS, starts=0, initial=[unstable], only_initial=True)
+    assert not made.certified
+    assert made.outcome is SectionsOutcome.NO_STABLE_START
