@@ -29,6 +29,8 @@ from ccd_casadi.inner_problem.problem import (
     require_as_returned,
 )
 from ccd_casadi.inner_problem.structured_problem import state_of
+from ccd_casadi.lti.between_samples import BetweenOptions, BetweenSamples, peak_between
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -109,6 +111,15 @@ def second_on_weighted(
     return replace(found, loops=len(opinions))
 
 
+def plants_of_set(problem: CoDesignProblem, theta: Sequence[float]) -> list[StateSpace]:
+    """The plants at θ that the certificate of sections is of, as they were written, SI."""
+    from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+
+    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
+    points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
+    return uncertain.as_written(points)
+
+
 def second_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign"
 ) -> EngineComparison:
@@ -117,18 +128,32 @@ def second_on_set(
     judged, K = design.certificate, design.controller
     if judged is None or K is None:
         return NOT_COMPARED
-    from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
-
-    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
-    points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
-    pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
-    of_GS, bounds = ("GS",) if problem.sampling is None else (), bounds_of(problem)
+    pairs = zip(plants_of_set(problem, theta), judged.plants, strict=True)
+    of_GS, bounds = ("GS",) if problem.sampling is None else (), kind_of(problem).bounds()
     return compared(
         (second_opinion(plant, K, problem.sampling, places=bounds.places),
          {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)}
          | {f"S of {one.name}": one.S_peak for one in figures.channels if bounds.places})
         for plant, figures in pairs
     )  # fmt: skip
+
+
+def between_on_set(
+    problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign",
+    options: BetweenOptions = BetweenOptions(),
+) -> BetweenSamples | None:  # fmt: skip
+    """S between the samples of a design's loops, on the plants of its certificate with the largest
+    peaks at the instants; None of a continuous loop, and where a plant is known at these alone."""
+    judged, K, sampling = design.certificate, design.controller, problem.sampling
+    if judged is None or K is None or sampling is None:
+        return None
+    plants = plants_of_set(problem, theta)
+    if plants[0].period or not all(figures.stable for figures in judged.plants):
+        return None
+    first = np.argsort([-figures.S_peak for figures in judged.plants])[: options.plants]
+    places = kind_of(problem).bounds().places
+    loops = [Loop(plants[i], K, sampling, at=places) for i in first]
+    return max((peak_between(loop, options) for loop in loops), key=lambda one: one.peak)
 
 
 KEPT = {

@@ -17,7 +17,12 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.final_judgement import other_damping, second_on_set, survived
+from ccd_casadi.codesign.final_judgement import (
+    between_on_set,
+    other_damping,
+    second_on_set,
+    survived,
+)
 from ccd_casadi.codesign.outer import Place, PolishedDesign, ThetaOuter, is_expensive, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.stored_searches import (
@@ -235,6 +240,7 @@ class StructuredOuter(ThetaOuter):
             if problem.figure is MOVE_TIME:
                 reported = stated_time(problem, best.theta, design.controller, best.value)
             second = second_on_set(problem, best.theta, design)
+            between = between_on_set(problem, best.theta, design)
             wide, checked, proof, drawn, lost = judgement()
             bar.advance()
         return VerifiedStructured(
@@ -261,6 +267,7 @@ class StructuredOuter(ThetaOuter):
             gap=gap,
             reported=reported,
             second=second,
+            between=between,
             counterexamples=on_box.counterexamples(wide, proof, worst, lost),
         )
 

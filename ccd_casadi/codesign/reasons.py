@@ -193,6 +193,10 @@ class Reason(Enum):
         "designed and judged at {rate_hz:g} Hz with a delay of {delay_us:g} us, hold and delay "
         "exact; run deploy for the code"
     )
+    BETWEEN = "S is {between_peak:.5g} at most between its samples"
+    BETWEEN_ABOVE = (
+        "S is {between_peak:.5g} between its samples, {beyond:100*.2g} % above S_max: sample faster"
+    )
     NOT_DEPLOYED = "not judged yet: run deploy"
     DELAY_MARGIN = (
         "below {unstable_below_rate_hz:round 3} Hz hold and one sample of delay use up the delay "

@@ -65,7 +65,7 @@ def result_dict(
         optimality(gap=verified.inner_gap),
         predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
         verified.survives_line(),
-        deployable(verified.survival, problem.sampling),
+        deployable(verified.survival, problem.sampling, verified.between, problem.inner.S_max),
     )
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}

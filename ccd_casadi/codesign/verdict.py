@@ -20,6 +20,7 @@ from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
+from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.optim.kkt import KktCertificate, KktOptions
 from ccd_casadi.synthesis.second_engine import EngineComparison
@@ -44,6 +45,8 @@ class VerdictOptions:
         Of its size: what a constraint may be exceeded by at an optimum.
     sigmas, left_out : float
         Left-out error at the design, in predicted deviations and relative, up to which it passes.
+    between_excess : float
+        Relative: of S_max, by which S may exceed it between the samples.
     most_words : int
         Of a line's sentence; what else is known follows as details.
     """
@@ -55,6 +58,7 @@ class VerdictOptions:
     primal: float = 1e-6
     sigmas: float = 3.0
     left_out: float = 0.01
+    between_excess: float = 0.01
     most_words: int = 25
 
 
@@ -411,13 +415,42 @@ def survives(
     return line(state, tuple(found))
 
 
-def deployable(survival: Survival | None, sampling: Sampling | None = None) -> Check:
+def between_finding(found: BetweenSamples, S_max: float, excess: float) -> tuple[bool, Finding]:
+    """Say what S is between the samples.
+
+    Parameters
+    ----------
+    found : BetweenSamples
+        On the plants with the largest peaks at the instants.
+    S_max, excess : float
+        The bound, and by how much of it S may exceed it there.
+
+    Returns
+    -------
+    bool
+        Whether it exceeds the bound by more.
+    Finding
+    """
+    beyond = found.peak / S_max - 1.0
+    reason = Reason.BETWEEN_ABOVE if beyond > excess else Reason.BETWEEN
+    return beyond > excess, reason(between_peak=found.peak, beyond=beyond)
+
+
+def deployable(
+    survival: Survival | None, sampling: Sampling | None = None,
+    between: BetweenSamples | None = None, S_max: float = math.inf,
+    options: VerdictOptions = VerdictOptions(),
+) -> Check:  # fmt: skip
     """Write the line `deployable` before `deploy`.
 
     Parameters
     ----------
     survival : Survival or None
     sampling : Sampling or None
+    between : BetweenSamples or None
+        Of a loop that was designed as sampled.
+    S_max : float
+    options : VerdictOptions
 
     Returns
     -------
@@ -430,7 +463,11 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> C
         figures |= {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
     if sampling is not None and survival is not None and survival.contradiction is None:
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
-        return line(State.PASSED, (Reason.DESIGNED_SAMPLED(),))
+        if between is None:
+            return line(State.PASSED, (Reason.DESIGNED_SAMPLED(),))
+        above, finding = between_finding(between, S_max, options.between_excess)
+        state = State.WARNED if above else State.PASSED
+        return line(state, (Reason.DESIGNED_SAMPLED(), finding))
     if survival is None or sampling is not None or not math.isfinite(survival.delay):
         return line(State.UNKNOWN, (Reason.NOT_DEPLOYED(),))
     # one period of delay, and half a period of hold

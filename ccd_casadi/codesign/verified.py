@@ -24,6 +24,7 @@ from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
@@ -59,6 +60,8 @@ class Verified(ABC):
         Off the model; None where the loop is not stable.
     second : EngineComparison
         Another engine on its loops.
+    between : BetweenSamples or None
+        S between the samples of a loop that was designed as sampled.
     """
 
     problem: CoDesignProblem
@@ -73,6 +76,7 @@ class Verified(ABC):
     survival: Survival | None
     damping: OtherDamping | None
     second: EngineComparison = NOT_COMPARED
+    between: BetweenSamples | None = None
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
     saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards

@@ -183,6 +183,7 @@ class VerifiedStructured(Verified):
             "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
             | {"tolerances_hz": {name: 0.01 * w / HZ for name, w in self.prices.items()}},
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
+            "between_samples": None if self.between is None else self.between.entry,
         }
         if structured.figure is not BANDWIDTH:
             entry = structured.figure.entry

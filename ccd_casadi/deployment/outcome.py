@@ -10,7 +10,7 @@ from ccd_casadi.analysis.loop_channels import LoopChannel
 from ccd_casadi.analysis.sampled_figures import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.reasons import Finding, Reason
-from ccd_casadi.codesign.verdict import Check, State
+from ccd_casadi.codesign.verdict import Check, State, VerdictOptions, between_finding
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.integer_loop import RoundingBound
 from ccd_casadi.deployment.integer_words import rounding_finding
@@ -22,6 +22,7 @@ from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -86,6 +87,9 @@ class Deployment:
         Of the code's coefficients on the plants as their function returned them.
     designed : Sampling or None
         How the loop was designed to run; None where K(s) was designed.
+    between : BetweenSamples or None
+        S between the samples, on the plants with the largest peaks at the instants; None of an
+        unstable loop.
     rounding : RoundingBound or None
         What integers add on the worst plant; None of floating point, and of an unstable loop.
     integer_faults : tuple of str
@@ -111,6 +115,7 @@ class Deployment:
     compliance_max: float | None = None
     judge: Judgement | None = None
     designed: Sampling | None = None
+    between: BetweenSamples | None = None
     rounding: RoundingBound | None = None
     integer_faults: tuple[str, ...] = ()
 
@@ -240,6 +245,7 @@ def deployed_line(run: FinishedRun, found: Deployment, moved: OnHardware | None 
         "judge": None if found.judge is None else found.judge.entry,
         "move": None if moved is None else moved.limited_entry,
         "rounding": None if found.rounding is None else found.rounding.largest,
+        "between_samples": None if found.between is None else found.between.entry,
     }
     line = partial(Check, "deployable", figures=figures)
     if found.shortfalls:
@@ -254,6 +260,11 @@ def deployed_line(run: FinishedRun, found: Deployment, moved: OnHardware | None 
     ended = ends.get(move.get("state", State.PASSED))
     doubts = [*reasons(run, found), *found.levels]
     doubts += [ended(force_limit=move["force_limit"])] if ended else []
+    if found.between is not None:
+        above, finding = between_finding(
+            found.between, found.target.S_max, found.target.excess + VerdictOptions.between_excess
+        )
+        (doubts if above else kept).append(finding)
     if found.rounding is not None:
         kept.append(rounding_finding(found.rounding))
     return line(State.WARNED if doubts else State.PASSED, (*doubts, *kept))
