@@ -130,7 +130,7 @@ def of_budget(
     """A solution as its time budget leaves it.
 
     Where that ended a search nothing is known of the optimum: `optimal` and its checks are unknown,
-    and a design is verified without them.
+    and a design is verified without them; `optimal` warns of one that is known to be not optimal.
 
     Parameters
     ----------
@@ -150,7 +150,8 @@ def of_budget(
     words = "; ".join(one.words() for one in ended)
     if words and "verdict" in result:
         line = Check.read("optimal", result["verdict"]["optimal"])
-        line = replace(line, state=State.UNKNOWN, findings=(*ended, *line.findings))
+        state = State.WARNED if line.state is State.FAILED else State.UNKNOWN
+        line = replace(line, state=state, findings=(*ended, *line.findings))
         verdict = result["verdict"] = {**result["verdict"], "optimal": line.entry}
         unknown = dict.fromkeys(("inner_optimum", "optimality"))
         checks = result["checks"] = {**result["checks"], **unknown}
