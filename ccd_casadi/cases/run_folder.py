@@ -33,17 +33,16 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     with_ports,
 )
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state, with_warm_start
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
-    state_of,
     structured_of,
-    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
-from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
+from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import ModalPlant, Perturbation

@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.structured_problem import state_of
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.lti.between_samples import BetweenOptions, BetweenSamples, peak_between
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace

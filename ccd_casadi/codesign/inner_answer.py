@@ -29,8 +29,8 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_design,
 )
+from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import with_state
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints

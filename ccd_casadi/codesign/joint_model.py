@@ -16,6 +16,7 @@ from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Loo
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.optim.trust_region import (
@@ -145,8 +146,7 @@ class JointModel(TrustRegionModel[JointLoops]):
     ) -> None:
         self.curved_plants, self.ends_early, self.options = curved_plants, ends_early, options
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
-        structured = structured_of(problem)
-        known = [(option, np.array(point)) for option, point in structured.state.scenarios]
+        known = [(option, np.array(point)) for option, point in state_of(problem).scenarios]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
         middle = (self.middle - lower) / self.width

@@ -43,11 +43,10 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.searched_problem import Scenario, state_of, with_warm_start
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import Scenario, state_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertified
-from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler

@@ -9,19 +9,23 @@ from functools import partial
 
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.searched_problem import (
+    Scenario,
+    state_of,
+    with_state,
+    with_warm_start,
+)
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
     StructuredValue,
     structured_value,
 )
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
     prepared,
     search_starts,
     with_range,
-    with_warm_start,
 )
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sample_keys import problem_hash, sample_key

@@ -31,17 +31,17 @@ from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.searched_problem import (
+    Scenario,
+    state_of,
+    with_state,
+    with_warm_start,
+)
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
     warm_starts_at,
-)
-from ccd_casadi.inner_problem.structured_problem import (
-    Scenario,
-    state_of,
-    structured_of,
-    with_state,
 )
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
@@ -157,8 +157,7 @@ def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
     alone = with_state(problem, warm_starts=(kappa,), error_warm_starts=())
-    own = structured_of(alone).with_warm_start(kappa, 1)
-    return replace(alone, controller=own, start=theta)
+    return replace(with_warm_start(alone, kappa, 1), start=theta)
 
 
 def _nothing(words: str) -> Solution:

@@ -27,8 +27,8 @@ from ccd_casadi.codesign.working_set import WorkingSet
 from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby
-from ccd_casadi.inner_problem.structured_problem import state_of
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler

@@ -30,15 +30,10 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.searched_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import (
-    Scenario,
-    state_of,
-    structured_of,
-    with_state,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
@@ -169,7 +164,7 @@ class VerifiedStructured(Verified):
         return design_dict(self.problem, self.theta, self.design)
 
     def evidence(self, predicted: float) -> dict[str, Any]:
-        structured = structured_of(self.problem)
+        structured, state = structured_of(self.problem), state_of(self.problem)
         found: dict[str, Any] = {
             "surrogate_bandwidth_hz": predicted / HZ if structured.figure is BANDWIDTH else None,
             "race": [
@@ -177,7 +172,7 @@ class VerifiedStructured(Verified):
                 for optimum in self.optima
             ],
             "rounds": self.rounds,
-            "anchors": [list(kappa) for kappa in structured.state.warm_starts],
+            "anchors": [list(kappa) for kappa in state.warm_starts],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
@@ -191,7 +186,7 @@ class VerifiedStructured(Verified):
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
                 f"{entry}_raced": None if self.multistart is None else self.multistart.value,
-                "error_anchors": [list(kappa) for kappa in structured.state.error_warm_starts],
+                "error_anchors": [list(kappa) for kappa in state.error_warm_starts],
             }
         if structured.uncertainty.ranges:
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
@@ -218,11 +213,11 @@ class VerifiedStructured(Verified):
         }
 
     def largest_at(self, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
-        judged, own = self.design.certificate, structured_of(self.problem)
+        judged = self.design.certificate
         if judged is None or not all(plant.stable for plant in judged.plants):
             return {}
         uncertain, low = uncertain_plant(self.problem, self.theta), bounds.omega_low / HZ
-        points = [(option, tuple(point)) for option, point in own.state.scenarios]
+        points = [(option, tuple(point)) for option, point in state_of(self.problem).scenarios]
         points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
         shares = [bounds.shares(plant) for plant in judged.plants]
         found = {}

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint
+from ccd_casadi.inner_problem.searched_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler

@@ -17,8 +17,8 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import require_as_returned
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -131,11 +131,11 @@ def _points(
 ) -> list[tuple[int, Array]]:
     """Corners of the box, the run's own set, `dense`: a lattice of `count` plants too; of a share
     the set alone."""
-    sections = structured_of(run.problem)
+    state = state_of(run.problem)
     if run.case.robust.share is not None:
-        return [(i, np.array(p)) for i, p in sections.state.scenarios]
-    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.state.scenarios)]
-    return points + (lattice(uncertain, count, sections.state.seed) if dense else [])
+        return [(i, np.array(p)) for i, p in state.scenarios]
+    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in state.scenarios)]
+    return points + (lattice(uncertain, count, state.seed) if dense else [])
 
 
 def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:

@@ -6,9 +6,9 @@ From the SI matrices of K and of every plant: the closed loop is rebuilt, its ei
 stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
 zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. Of
 every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raised`). A sampled
-loop is judged in z, its hold and delay exact, K by Tustin's rule; between its samples S is that of
-`lti.between_samples`. Its GS and weighted KS and T are products of functions of z and of s, which no
-Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
+loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
+`lti.between_samples`). Its GS and weighted KS and T are products of functions of z and of s, which
+no Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
 """
 
 from collections.abc import Sequence

@@ -6,7 +6,7 @@ beside the samples that it determines.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -116,7 +116,7 @@ class CoDesignProblem(NotebookHtml):
         w, robust = self.weights, self.robust
         with_disturbance = (w.disturbance,) if w.disturbance else ()
         perturbed: dict[str, object] = {} if robust is None else {"robust": vars(robust)}
-        perturbed |= self.controller.identity_with(w, self.budget)
+        perturbed |= self.controller_identity()
         if self.inner.compliance_max is not None:
             perturbed["compliance"] = True
         return {
@@ -138,6 +138,10 @@ class CoDesignProblem(NotebookHtml):
             "gamma_backoff": self.inner.gamma_backoff,
             **perturbed,
         }
+
+    def controller_identity(self) -> dict[str, Any]:
+        """The part of `identity` that its controller states."""
+        return self.controller.identity_with(self.weights, self.budget)
 
     @property
     def figure(self) -> FigureOfMerit:

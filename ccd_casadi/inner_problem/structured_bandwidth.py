@@ -19,6 +19,7 @@ from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
@@ -26,7 +27,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     warm_starts_at,
 )
-from ccd_casadi.inner_problem.structured_problem import state_of, structured_of, with_state
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -228,7 +229,7 @@ class ProblemAt:
         problem, structured = self.problem, structured_of(self.problem)
         return synthesise_sections(
             self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
-            starts=starts or 0, most_starts=most_starts, seed=structured.state.seed,
+            starts=starts or 0, most_starts=most_starts, seed=state_of(self.problem).seed,
             initial=initial, only_initial=starts is None,
             frequencies=structured.frequencies, progress=tell, workers=workers,
         )  # fmt: skip
@@ -255,7 +256,7 @@ class ProblemAt:
         """The least of the problem's figure from a certified design and its warm starts."""
         problem, structured = self.problem, structured_of(self.problem)
         bounds = bounds_of(problem)
-        started = with_state(problem, warm_starts=structured.state.error_warm_starts)
+        started = with_state(problem, warm_starts=state_of(problem).error_warm_starts)
         return least_value(
             self.plants, bounds, design, self.goal, sampling=structured.sampling,
             least_bandwidth=structured.bandwidth_least,
@@ -316,8 +317,7 @@ def structured_value(
         spent += 1
     if problem.figure is not BANDWIDTH and not (made and made.certified):
         # Controllers of least error meet every bound where those of most bandwidth may not.
-        structured = structured_of(problem)
-        started = with_state(problem, warm_starts=structured.state.error_warm_starts)
+        started = with_state(problem, warm_starts=state_of(problem).error_warm_starts)
         others = warm_starts_at(started, structure_of(problem), here.plants, bounds_of(problem))
         if others:
             made = here.searched(others, workers=workers)

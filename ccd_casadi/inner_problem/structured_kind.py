@@ -7,9 +7,10 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.inner_kind import InnerKind
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
-from ccd_casadi.inner_problem.structured_problem import state_of, structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -23,11 +23,11 @@ from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, with_options
+from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
     of_sensor,
-    state_of,
     structured_of,
     with_structured,
 )
@@ -325,10 +325,10 @@ def warm_starts_at(
         κ in SI.
     """
     structured = structured_of(problem)
-    if not structured.state.warm_starts:
+    if not state_of(problem).warm_starts:
         return []
     first = scaled_plant(problem, problem.start)
-    warm_starts = [np.array(kappa) for kappa in structured.state.warm_starts]
+    warm_starts = [np.array(kappa) for kappa in state_of(problem).warm_starts]
 
     def nearer(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds

@@ -9,7 +9,7 @@ Everything is plain values, as in `problem`: it is hashed, sent to workers and k
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.structure import Structure
@@ -29,8 +29,6 @@ from ccd_casadi.synthesis.weights import Weights
 if TYPE_CHECKING:  # that states its controller by this module
     from ccd_casadi.budget.sources import ErrorBudget
     from ccd_casadi.inner_problem.problem import CoDesignProblem
-
-Scenario = tuple[int, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -55,26 +53,6 @@ class Uncertainty:
     gain: float = 0.0
     options: tuple[Options, ...] = ()
     ranges: tuple[tuple[str, float, float], ...] = ()
-
-
-@dataclass(frozen=True)
-class SearchState:
-    """What a search has found: with it v(θ) is the best of the climbs from the warm starts, on the
-    plants of the scenarios. The problem that a case states has none yet.
-
-    Attributes
-    ----------
-    warm_starts, error_warm_starts : tuple of κ in SI
-        Of the largest bandwidth; of the least RMS error or move time.
-    scenarios : tuple of (option, point of the box)
-    seed : int
-        Of the multi-start search that finds them.
-    """
-
-    warm_starts: tuple[tuple[float, ...], ...] = ()
-    error_warm_starts: tuple[tuple[float, ...], ...] = ()
-    scenarios: tuple[Scenario, ...] = ()
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -148,8 +126,6 @@ class StructuredProblem(ControllerProblem):
         Of a plant with several outputs.
     bandwidth_of : str or None
         Of several sensors on one actuator: the channel whose error counts.
-    state : SearchState
-        What a search has found, apart from all that the case states.
     """
 
     kernels: ClassVar[tuple[str, ...]] = ("loops",)
@@ -167,7 +143,6 @@ class StructuredProblem(ControllerProblem):
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
     bandwidth_of: str | None = None
-    state: SearchState = field(default_factory=SearchState)
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -227,26 +202,16 @@ class StructuredProblem(ControllerProblem):
             words = f"{self.bandwidth_of!r} is none of the channels {', '.join(names)}"
             raise PlantError(f"controller.bandwidth_of = {words}; name one of them")
 
-    def with_warm_start(self, kappa: tuple[float, ...], most: int) -> Self:
-        """With one more warm start of what it minimises, first, `most` at most; as it is by the κ
-        of a design that has no controller."""
-        if not kappa:
-            return self
-        name = "warm_starts" if self.figure is BANDWIDTH else "error_warm_starts"
-        others = (known for known in getattr(self.state, name) if known != kappa)
-        found = {name: (kappa, *others)[:most]}
-        return replace(self, state=replace(self.state, **found))  # type: ignore[arg-type]
-
     def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
         """Its own, ω_T that bounds KS and T, and what moves the stage where that counts."""
-        found = {"sections": self.identity() | {"omega_T": weights.omega_T}}
+        found: dict[str, Any] = {"sections": self.identity() | {"omega_T": weights.omega_T}}
         if self.figure is RMS_ERROR:
             assert budget is not None
             found["budget"] = asdict(budget)
         return found
 
     def identity(self) -> dict[str, Any]:
-        """What determines ω_b*(θ), as plain values."""
+        """What determines ω_b*(θ), as plain values; of no search state (`SearchedProblem`)."""
         structure, sampling = self.structure, self.sampling
         found: dict[str, Any] = {
             "structure": vars(structure),
@@ -257,10 +222,10 @@ class StructuredProblem(ControllerProblem):
             "uncertainty": vars(self.uncertainty)
             | {"options": [dict(options) for options in self.uncertainty.options]},
             "starts": self.starts,
-            "seed": self.state.seed,
+            "seed": 0,
             "frequencies": self.frequencies,
-            "anchors": self.state.warm_starts,
-            "members": self.state.scenarios,
+            "anchors": (),
+            "members": (),
         }
         if not self.uncertainty.ranges:  # as stores knew it before
             del found["uncertainty"]["ranges"]
@@ -273,7 +238,7 @@ class StructuredProblem(ControllerProblem):
         if self.bandwidth_of is not None:
             found["bandwidth_of"] = self.bandwidth_of
         if self.figure is not BANDWIDTH:
-            found["least_error"] = [self.bandwidth_least, self.state.error_warm_starts]
+            found["least_error"] = [self.bandwidth_least, ()]
         return found
 
 
@@ -290,37 +255,6 @@ def structured_of(problem: "CoDesignProblem") -> StructuredProblem:
     """
     assert isinstance(problem.controller, StructuredProblem)
     return problem.controller
-
-
-def state_of(problem: "CoDesignProblem") -> SearchState:
-    """Take what a search has found for a structured problem.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-
-    Returns
-    -------
-    SearchState
-    """
-    return structured_of(problem).state
-
-
-def with_state(problem: "CoDesignProblem", **changes: object) -> "CoDesignProblem":
-    """Change fields of a structured problem's `SearchState`; what the case states stays.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    changes
-        Fields by name.
-
-    Returns
-    -------
-    CoDesignProblem
-    """
-    state = replace(state_of(problem), **changes)  # type: ignore[arg-type]
-    return with_structured(problem, state=state)
 
 
 def with_structured(problem: "CoDesignProblem", **changes: object) -> "CoDesignProblem":

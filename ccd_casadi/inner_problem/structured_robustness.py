@@ -24,6 +24,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
 )
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, require_as_returned
+from ccd_casadi.inner_problem.searched_problem import Scenario, state_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
     StructuredValueOptions,
@@ -35,7 +36,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario, state_of, structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -150,9 +151,11 @@ class DesignOnBox:
         if not uncertain.names:
             return list(uncertain.corners()[: 1 + len(structured.uncertainty.options)])
         points = lattice(
-            uncertain, options.lattice, structured.state.seed + options.lattice_seed + options.turn
+            uncertain,
+            options.lattice,
+            state_of(self.problem).seed + options.lattice_seed + options.turn,
         )
-        known = [(option, np.array(point)) for option, point in structured.state.scenarios]
+        known = [(option, np.array(point)) for option, point in state_of(self.problem).scenarios]
         return [*points, (worst.option, worst.point), *known]
 
     def on_lattice(self, worst: Excess, workers: Pool | None = None) -> tuple[SetCertificate, int]:
@@ -176,7 +179,7 @@ class DesignOnBox:
         """
         if not self.uncertain.names:
             return ()
-        bounds, structured = bounds_of(self.problem), structured_of(self.problem)
+        bounds, state = bounds_of(self.problem), state_of(self.problem)
         level = (1.0 + self.options.looseness) * (1.0 + JudgeOptions.tolerance)
         found: list[tuple[float, Scenario]] = []
         for one, (option, point) in zip(wide.plants, self.lattice_points(worst), strict=True):
@@ -187,7 +190,7 @@ class DesignOnBox:
         found.sort(key=lambda pair: -pair[0])
         if proof.refuted:
             found.insert(0, (np.inf, (proof.option, tuple(map(float, proof.point)))))
-        known, all_found = structured.state.scenarios, [*(plant for _, plant in found), *lost]
+        known, all_found = state.scenarios, [*(plant for _, plant in found), *lost]
         fresh = dict.fromkeys(plant for plant in all_found if plant not in known)
         return tuple(fresh)[: self.options.added]
 
@@ -198,11 +201,11 @@ class DesignOnBox:
         Options are equally likely. None where there is no box. Every `turn` has draws of its own,
         and each may be wrong: the confidence counts all of them.
         """
-        structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
+        state, uncertain, options = state_of(self.problem), self.uncertain, self.options
         if not uncertain.names or self.design.controller is None:
             return None, ()
         count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
-        rng = np.random.default_rng((structured.state.seed, options.fresh_seed + options.turn))
+        rng = np.random.default_rng((state.seed, options.fresh_seed + options.turn))
         points = uncertain.drawn(rng, count)
         kept = self.kept(points, workers)
         lost = [(option, tuple(map(float, point))) for (option, point), good
@@ -313,7 +316,7 @@ def violations(
         for head in heads:
             near = [
                 float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
-                for option, point in (*structured.state.scenarios, *found)
+                for option, point in (*state_of(problem).scenarios, *found)
                 if option == head.option
             ]
             apart = not near or min(near) > options.apart
@@ -323,7 +326,7 @@ def violations(
 
     examined = 0
     for along in (lines.along_first, lines.along) if uncertain.ranges else (lines.along,):
-        seed = structured.state.seed + turn
+        seed = state_of(problem).seed + turn
         heads, more = worst_plants(loop, seed, count, workers=workers, along=along)
         heads, examined = sorted([*before, *heads], key=lambda head: -head.value), examined + more
         worse = fresh(heads)

@@ -6,7 +6,7 @@ found.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,16 +16,16 @@ from ccd_casadi.fixed_structure.local_search import OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.searched_problem import (
+    WarmStartOptions,
+    state_of,
+    with_state,
+    with_warm_start,
+)
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant, with_channels
-from ccd_casadi.inner_problem.structured_problem import (
-    state_of,
-    structured_of,
-    with_state,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.time_budget import ends_early, time_is_up
@@ -35,7 +35,7 @@ from ccd_casadi.support.time_budget import ends_early, time_is_up
 class StructuredSearchOptions:
     """Numbers of the search of a controller of fixed structure on a box of plants."""
 
-    warm_starts: int = 3  # that are kept
+    warm_starts: int = WarmStartOptions.found  # that are kept
     least_starts: int = 12  # before no controller within the bounds counts as found
     most_starts: int = 36  # of a search that has found its best only once
     distinct: float = 0.1  # relative: local optima further below the best are not warm starts
@@ -72,7 +72,7 @@ def search_starts(
     SectionsDesign
     """
     here, structured = ProblemAt(problem, theta), structured_of(problem)
-    warm_starts = [np.array(kappa) for kappa in structured.state.warm_starts]
+    warm_starts = [np.array(kappa) for kappa in state_of(problem).warm_starts]
     starts = None if only_warm_starts else structured.starts
     made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
     least = options.least_starts
@@ -191,23 +191,6 @@ def _warm_starts(
         if (1.0 - options.distinct) * omega_b <= optimum.bandwidth < (1.0 - 1e-3) * omega_b
     ]
     return (own, *others)[: options.warm_starts]
-
-
-def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) -> CoDesignProblem:
-    """Add a warm start of what a problem minimises, as the first.
-
-    Parameters
-    ----------
-    problem, kappa : CoDesignProblem, array (n,)
-        κ in SI.
-
-    Returns
-    -------
-    CoDesignProblem
-    """
-    structured, most = structured_of(problem), StructuredSearchOptions.warm_starts + 1
-    structured = structured.with_warm_start(tuple(map(float, kappa)), most)
-    return replace(problem, controller=structured)
 
 
 def least_from(

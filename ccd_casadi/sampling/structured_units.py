@@ -6,15 +6,15 @@ controller.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.inner_problem.searched_problem import with_warm_start
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.inner_problem.structured_search import with_warm_start
+from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.units import InnerUnits, Retry, Theta, Unit, json_number
@@ -75,8 +75,7 @@ def from_controller(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesig
     CoDesignProblem
         With it as the only warm start.
     """
-    structured = structured_of(problem).with_warm_start(tuple(map(float, kappa)), 1)
-    return replace(problem, controller=replace(structured, starts=0))
+    return with_structured(with_warm_start(problem, kappa, 1), starts=0)
 
 
 def promising_starts(

@@ -25,8 +25,8 @@ from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structure_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import with_state
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler

@@ -23,13 +23,12 @@ from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import (
     StructuredProblem,
     Uncertainty,
-    state_of,
-    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import (

@@ -21,12 +21,9 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.stored_searches import with_initial_search
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
-from ccd_casadi.inner_problem.structured_problem import (
-    StructuredProblem,
-    with_state,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem, with_structured
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
@@ -53,7 +50,7 @@ def test_the_gradient_is_the_slope_of_the_least_error(
 ) -> None:
     case = anchored(least(sampling), tmp_path)
     assert isinstance(case.controller, StructuredProblem)
-    assert case.controller.state.error_warm_starts
+    assert state_of(case).error_warm_starts
     theta, h = np.array([61.0, 59.0]), 0.05
     value = structured_value(case, theta)
     assert value.feasible
@@ -63,7 +60,7 @@ def test_the_gradient_is_the_slope_of_the_least_error(
     numeric = (ends[0].error - ends[1].error) / (2.0 * h)
     assert np.array(value.gradient) @ way == pytest.approx(numeric, rel=1e-4)
     # where the controllers of most bandwidth are not stable those of least error begin the search
-    unstable = tuple(tuple(k + 40.0 for k in kappa) for kappa in case.controller.state.warm_starts)
+    unstable = tuple(tuple(k + 40.0 for k in kappa) for kappa in state_of(case).warm_starts)
     lost = with_state(with_structured(case, starts=0), warm_starts=unstable)
     again = structured_value(lost, theta)
     assert again.error == pytest.approx(value.error, rel=1e-3)

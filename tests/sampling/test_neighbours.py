@@ -13,13 +13,13 @@ from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_problem import (
+from ccd_casadi.inner_problem.searched_problem import (
     SearchState,
-    StructuredProblem,
     state_of,
-    structured_of,
     with_state,
+    with_warm_start,
 )
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling import sampler as module
 from ccd_casadi.sampling.sample_keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
@@ -37,9 +37,8 @@ def branches(cliff: float, required: list[tuple]) -> Callable[[tuple], tuple]:
         task: tuple[CoDesignProblem, str, str, tuple[float, ...]], workers: object = None
     ) -> tuple[list, tuple]:
         case, _, key, theta = task
-        sections, z = case.controller, (theta[0] - 55.0) / 15.0
-        assert isinstance(sections, StructuredProblem)
-        known = {*sections.state.warm_starts, *sections.state.error_warm_starts}
+        state, z = state_of(case), (theta[0] - 55.0) / 15.0
+        known = {*state.warm_starts, *state.error_warm_starts}
         kappa = GOOD if GOOD in known or z < cliff else POOR
         value, slope = 250.0 + 10.0 * z, 10.0
         if kappa == GOOD:
@@ -57,8 +56,9 @@ def branches(cliff: float, required: list[tuple]) -> Callable[[tuple], tuple]:
 
 
 def two_branches(**changes: object) -> CoDesignProblem:
-    sections = replace(StructuredProblem(state=SearchState(warm_starts=(POOR,))), **changes)  # type: ignore[arg-type]
-    return problem(controller=sections, w1=0.0, w2=-1.0 if "minimise" not in changes else 1e6)
+    sections = replace(StructuredProblem(), **changes)  # type: ignore[arg-type]
+    w2 = -1.0 if "minimise" not in changes else 1e6
+    return with_state(problem(controller=sections, w1=0.0, w2=w2), warm_starts=(POOR,))
 
 
 @few(max_examples=10)
@@ -112,9 +112,9 @@ def test_a_controller_given_for_a_theta_counts_where_it_is_better(
 
 def test_a_design_without_a_controller_is_no_warm_start() -> None:
     """A search at its θ begins from others': an empty κ had ended a run in a traceback."""
-    known = StructuredProblem(state=SearchState(warm_starts=(POOR,)))
-    assert known.with_warm_start((), 3) == known
-    assert known.with_warm_start(GOOD, 3).state.warm_starts == (GOOD, POOR)
+    known = with_state(problem(controller=StructuredProblem()), warm_starts=(POOR,))
+    assert with_warm_start(known, ()) == known
+    assert state_of(with_warm_start(known, GOOD)).warm_starts == (GOOD, POOR)
 
 
 KAPPAS = st.lists(st.tuples(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0)), max_size=3).map(tuple)
@@ -141,7 +141,7 @@ def test_a_search_state_leaves_the_statement_and_has_its_own_key(
     }
     if of_error:
         own["least_error"] = [0.0, state.error_warm_starts]
-    identity, before = (structured_of(one).identity() for one in (found, stated))
+    identity, before = (one.controller_identity()["sections"] for one in (found, stated))
     assert identity == before | own
     assert list(identity) == list(before)
     if identity != before:

@@ -25,8 +25,9 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     scaled_system,
 )
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_problem import state_of, structured_of
+from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
@@ -264,12 +265,11 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     """The problem with the warm starts, plant set and channels of one that was designed before."""
     if known is None:
         return problem
-    mine, theirs = structured_of(problem), structured_of(known)
-    state = theirs.state
+    mine, theirs, state = structured_of(problem), structured_of(known), state_of(known)
     if mine.uncertainty != theirs.uncertainty:
         state = replace(state, scenarios=())
-    taken = replace(mine, state=state, channels=theirs.channels, frequencies=theirs.frequencies)
-    return replace(problem, controller=taken, start=known.start)
+    taken = replace(mine, channels=theirs.channels, frequencies=theirs.frequencies)
+    return with_state(replace(problem, controller=taken, start=known.start), **vars(state))
 
 
 def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:

@@ -19,12 +19,11 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import (
     StructuredProblem,
-    state_of,
     structured_of,
-    with_state,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox

@@ -21,7 +21,7 @@ from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, buy
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_problem import state_of, with_state
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.plants.plant import hardware_cost

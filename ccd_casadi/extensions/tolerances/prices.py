@@ -15,13 +15,9 @@ import numpy as np
 from ccd_casadi.extensions.tolerances.machines import tolerance_of
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import (
-    Uncertainty,
-    structured_of,
-    with_state,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.support.arrays import Array

@@ -24,16 +24,15 @@ from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import (
+from ccd_casadi.inner_problem.searched_problem import (
     Scenario,
-    Uncertainty,
     state_of,
-    structured_of,
     with_state,
-    with_structured,
+    with_warm_start,
 )
-from ccd_casadi.inner_problem.structured_search import prepared, with_warm_start
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of, with_structured
+from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
@@ -265,7 +264,7 @@ def started(
         if not made.certified:
             raise NoDesign(f"no controller was found for the model alone: {made.words}")
         own, kappa = structured_of(found), made.kappa
-        problem = with_state(problem, warm_starts=own.state.warm_starts)
+        problem = with_state(problem, warm_starts=state_of(found).warm_starts)
         problem = with_structured(problem, channels=own.channels, frequencies=own.frequencies)
     options = range(1 + len(structured_of(problem).uncertainty.options))
     model = uncertain_plant(problem, theta).nominal
