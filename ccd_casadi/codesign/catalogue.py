@@ -153,8 +153,8 @@ def best_of_lists(
         if nodes and ends_early("listed combination", left):
             break
         open_.remove(part)
-        if part.lists == exchanged:
-            continue  # it was designed before the first part was split
+        if part.lists == exchanged and part.found is None:
+            continue  # it was searched before the first part was split
         if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
             rows = product(*([(v,) for v in values] for values in part.lists.values()))
             open_ += [replace(part, lists=dict(zip(part.lists, row, strict=True))) for row in rows]
@@ -191,15 +191,20 @@ def best_of_lists(
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
         if exchanges and len(nodes) == 1 and not whole and np.isfinite(J):
-            exchanged, tried = _exchanged(problem, each, found, options)
+            of = each.of(found.problem or own) if judge else each  # with its warm starts
+            exchanged, tried = _exchanged(problem, of, found, options)
             own = restricted(problem, exchanged)
-            best = at(sampler.of(own), found)
-            best = replace(best, problem=best.problem or own)
-            J = best.result.get("objective", np.inf)
-            words = _made_of(problem, best.result)
-            node = Node(exchanged, best.result["status"], J, words)
+            first = at(sampler.of(own), found)
+            first = replace(first, problem=first.problem or own)
+            J = first.result.get("objective", np.inf)
+            words = _made_of(problem, first.result)
+            node = Node(exchanged, first.result["status"], J, words)
             nodes[tuple(exchanged.values())] = node
-            known += [best] if np.isfinite(J) else []
+            known += [first] if np.isfinite(J) else []
+            if judge is None:
+                best = first
+            elif np.isfinite(J):
+                open_.append(_Part(exchanged, J, _point(first), first))
         remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
     if best is None:  # the time was up
         with stage(StageOptions.ending):

@@ -286,7 +286,7 @@ def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution
         of = ListedStructured(
             formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
         )
-        best = best_of_lists(sampler, of.search, of.search, of.judge)
+        best = best_of_lists(sampler, of.between, of.search, of.judge, exchanges=True)
         if best.verified is None:  # a search near by knows nothing of the run
             whole = infeasible_dict(terms, best.result["reason"], sampler.spent.by_purpose)
             best = replace(best, result={**whole, "listed": best.result["listed"]})

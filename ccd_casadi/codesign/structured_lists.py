@@ -25,7 +25,7 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.stored_searches import printer
-from ccd_casadi.codesign.theta_joint import joint_search
+from ccd_casadi.codesign.theta_joint import JointSearchOptions, joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -51,11 +51,25 @@ from ccd_casadi.support.text import HZ
 from surrogates import design
 
 
+@dataclass(frozen=True)
+class ListedOptions:
+    """Numbers of the searches over lists.
+
+    Attributes
+    ----------
+    settled : float
+        Of the terms of J: between the values of a list a step that promises less is not taken, as
+        no design is there. J itself may be near 0.
+    """
+
+    settled: float = 1e-3
+
+
 @dataclass
 class ListedStructured:
-    """`search` and `judge` as `best_of_lists` asks for them.
+    """`between`, `search` and `judge` as `best_of_lists` requires them.
 
-    `solve` goes on from a θ to a whole co-design. `scenarios`: all plants that were found worse
+    `solve` continues from a θ to a whole co-design. `scenarios`: all plants that were found worse
     than those of the set, at any of the θ.
     """
 
@@ -63,34 +77,41 @@ class ListedStructured:
     seed: int
     solve: Callable[[Sampler, Array], Solution]
     scenarios: tuple[Scenario, ...] = ()
+    options: ListedOptions = ListedOptions()
 
-    def search(self, sampler: Sampler, near: Solution | None) -> Solution:
+    def between(self, sampler: Sampler, near: Solution | None) -> Solution:
+        """As `search`, to the accuracy that a bound needs."""
+        return self.search(sampler, near, self.options.settled)
+
+    def search(
+        self, sampler: Sampler, near: Solution | None, settled: float | None = None
+    ) -> Solution:
         """The least J that is found with every value in the ranges of the sampler's problem."""
         problem = sampler.problem
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
             return _nothing(forbidden)
-        found = self._anew(sampler) if near is None else self._near(sampler, near)
+        found = self._anew(sampler, settled) if near is None else self._near(sampler, near, settled)
         if found.problem is not None:
             self.scenarios = state_of(found.problem).scenarios
         return found
 
-    def _anew(self, sampler: Sampler) -> Solution:
+    def _anew(self, sampler: Sampler, settled: float | None) -> Solution:
         outer = StructuredOuter(sampler).prepared(self.seed)
-        found = _climbed(outer.sampler, np.array(sampler.problem.start))
+        found = _climbed(outer.sampler, np.array(sampler.problem.start), settled)
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
             allowed = _allowed(sampler.problem, theta)
             if not np.isfinite(found.result.get("objective", np.inf)) and allowed is not None:
-                found = _climbed(outer.sampler, allowed)
+                found = _climbed(outer.sampler, allowed, settled)
         return found
 
-    def _near(self, sampler: Sampler, near: Solution) -> Solution:
+    def _near(self, sampler: Sampler, near: Solution, settled: float | None) -> Solution:
         problem, known = sampler.problem, _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta within the constraints was found")
-        return _climbed(sampler.of(carried(known, problem, self.scenarios)), theta)
+        return _climbed(sampler.of(carried(known, problem, self.scenarios)), theta, settled)
 
     def judge(self, sampler: Sampler, solution: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
@@ -102,16 +123,23 @@ class ListedStructured:
         return whole
 
 
-def _climbed(sampler: Sampler, theta: Array) -> Solution:
-    """From θ to the least J near by; by steps along the truth where the joint search breaks λ."""
+def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> Solution:
+    """From θ to the least J near by; by steps along the truth where the joint search breaks λ.
+
+    `settled`: of the terms of J, as in `ListedOptions`; None: as near as any joint search."""
     best = first = sampler.values(theta, "near by")[0]
-    required = sampler
+    required, options = sampler, JointSearchOptions()
+    J = objective_of(sampler.problem, first)
+    if settled is not None and J:
+        hardware = sampler.problem.w1 * hardware_cost(plant_of(sampler.problem), first.theta)
+        share = settled * (abs(hardware) + abs(J - hardware)) / abs(J)
+        options = replace(options, model=replace(options.model, settled=share))
     if sampler.problem.figure is BANDWIDTH:
         tell = printer("near by", sampler.quiet)
-        required, best, _ = joint_search(sampler, theta, tell, ends=())
+        required, best, _ = joint_search(sampler, theta, tell, ends=(), options=options)
     if best.theta == first.theta or violated(required.problem, best.theta):  # it lost λ
-        options = ThetaDescentOptions()
-        best = pieces_from(sampler, first, options.settled, options.far_radius)
+        descent = ThetaDescentOptions()
+        best = pieces_from(sampler, first, descent.settled, descent.far_radius)
         required = sampler
     problem = required.problem
     J = objective_of(problem, best)
