@@ -29,7 +29,12 @@ from ccd_casadi.codesign.theta_joint import JointSearchOptions, joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
-from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.objective import (
+    ConstraintOptions,
+    constraint_shares,
+    objective_of,
+    violated,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.searched_problem import (
     Scenario,
@@ -194,12 +199,24 @@ def _nothing(words: str) -> Solution:
 
 
 def _allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-7) -> Array | None:
-    """The nearest θ within the box and λ(θ) <= -`inside`; None where none is found."""
+    """The nearest θ within the box and λ(θ) <= -`inside`; None where none is found.
+
+    A constraint on listed values alone is a number here, which may be 0: as many places are chosen
+    as may be.
+    """
     bounds, plant, x = box(problem), plant_of(problem), ca.MX.sym("theta", len(theta))
     lam, theta = plant.hardware(x)[1], np.clip(theta, *bounds)
+    if not lam.numel():
+        return theta
+    moves = np.array(ca.which_depends(lam, x, 1, True))
+    if (constraint_shares(problem, theta)[~moves] > ConstraintOptions.met).any():
+        return None
+    rows = np.flatnonzero(moves).tolist()
+    if not rows:
+        return theta
     f = ca.sumsqr((x - theta) / bounds.width)
-    program = NonlinearProgram(x, f, lam + inside, bounds, plant.exact_hessian)
+    program = NonlinearProgram(x, f, lam[rows] + inside, bounds, plant.exact_hessian)
     try:
-        return np.clip(solve_program(program, theta).best.x, *bounds) if lam.numel() else theta
+        return np.clip(solve_program(program, theta).best.x, *bounds)
     except OuterFailure:
         return None

@@ -3,9 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from oracles.kinds import PID, quick
 
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import stored_searches, structured_lists
 from ccd_casadi.codesign.catalogue import restricted
 from ccd_casadi.codesign.formulations import Direct
@@ -14,6 +17,7 @@ from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem import structured_search
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of
 from ccd_casadi.sampling.sampler import Sampler
@@ -87,3 +91,62 @@ def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     assert found.result["status"] == "searched"
     assert found.problem is not None
     assert found.problem.source.held["m1"] == VALUES[-1]
+
+
+CHOICE = """import casadi as ca
+
+def stage(theta):
+    k, m = 4e6 * theta["k"], 10.0 + theta["a"] + theta["b"]
+    return {
+        "mass": ca.diag(ca.vertcat(m, 1.0)), "stiffness": k * ca.DM([[1, -1], [-1, 1]]),
+        "damping_ratio": 0.01, "input": ca.DM([1, 0]), "output": ca.DM([[1, 0]]),
+        "hardware_cost": m, "constraints": {
+            "chosen": theta["a"] + theta["b"] - 1, "stiff": theta["k"] - 1.5},
+    }
+"""
+CASE = """[plant]
+function = "choice.py:stage"
+[theta.k]
+lower = 1.0
+upper = 2.0
+[theta.a]
+values = [0, 1]
+[theta.b]
+values = [0, 1]
+[objective]
+w1 = 1.0
+w2 = -1.0
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 300.0
+M_K = 1e6
+A_l = 1.0
+A_u = 1e-2
+[inner]
+S_max = 2.0
+S_low = 0.1
+omega_low_hz = 1.0
+omega_S_hz = [5.0, 1000.0]
+omega_T_hz = [50.0, 1000.0]
+[controller]
+structure = "sections"
+"""
+
+
+@pytest.mark.parametrize(("a", "b", "kept"), [(0, 0, True), (1, 0, True), (1, 1, False)])
+def test_as_many_places_may_be_chosen_as_the_constraint_allows(
+    a: int, b: int, kept: bool, tmp_path: Path
+) -> None:
+    """With a = 1 the constraint is the number 0: met, though no θ is inside it."""
+    (tmp_path / "choice.py").write_text(CHOICE)
+    (tmp_path / "case.toml").write_text(CASE)
+    problem = restricted(
+        problem_of(load_case(tmp_path / "case.toml")), {"a": (float(a),), "b": (float(b),)}
+    )
+    found = structured_lists._allowed(problem, np.array([1.9]))
+    assert (found is not None) == kept
+    if found is not None:
+        assert found[0] == pytest.approx(1.5, abs=1e-6)
+        assert not violated(problem, found)
