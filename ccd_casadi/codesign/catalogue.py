@@ -290,7 +290,8 @@ def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: f
     a person may wait for that."""
     J = min((node.objective for node in nodes if node.whole), default=np.inf)
     best = f"best J {J:.6g}" if np.isfinite(J) else "no combination searched yet"
-    rest, bound = sum(part.count for part in left), min((p.bound for p in left), default=np.inf)
+    rest = sum(part.count for part in left if part.found is None)
+    bound = min((part.bound for part in left), default=np.inf)
     there = f" with J from {bound:.6g}" if np.isfinite(bound) else ""
     seconds = (perf_counter() - began) / len(nodes) * rest
     more = f", {duration(seconds)} at most" if seconds <= BranchOptions.foreseen else ""
