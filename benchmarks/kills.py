@@ -102,7 +102,8 @@ def table(folder: Path) -> list[tuple[Any, ...]]:
 def result(folder: Path) -> dict[str, Any]:
     """result.json without what no two runs share."""
     found: dict[str, Any] = json.loads((folder / "result.json").read_text())
-    found.pop("seconds")
+    for name in ("seconds", "phase_seconds"):
+        found.pop(name)
     return found
 
 
