@@ -9,7 +9,7 @@ from types import ModuleType
 
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import ExitCode
-from ccd_casadi.support.interrupts import raise_on_ctrl_c
+from ccd_casadi.support.errors import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.text import package_text, template

@@ -66,7 +66,7 @@ SHOTS = {
                              "templates/deploy.txt")),
     "report": Shot("built", "report.html", 1240, REPORT),
     "tune": Shot("tuned", "report.html", 900,
-                 (*DRAWN, "extensions/measured/measured_page.py", "reporting/gain_figures.py",
+                 (*DRAWN, "extensions/measured/measured_answer.py", "reporting/gain_figures.py",
                   "reporting/nyquist.py")),
     "insight": Shot("front", "insight.html", 945,
                     (*reporting("insight_page", "decision", "run_verdict"),

@@ -136,7 +136,7 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     parts = design_parts(problem, own, theta, view, result)
     if "proof" in result:  # of a fixed structure
         from ccd_casadi.codesign.verified_structured import VerifiedStructured
-        from ccd_casadi.reporting.structured_page import bandwidths_table
+        from ccd_casadi.reporting.limit_figures import bandwidths_table
 
         assert isinstance(verified, VerifiedStructured)
         table = bandwidths_table(verified)
@@ -171,11 +171,11 @@ def design_parts(
         "loop": lambda: _loop(own, theta, view),
     }
     if "proof" in result:
-        from ccd_casadi.reporting.structured_page import controller_blocks
+        from ccd_casadi.reporting.limit_figures import controller_blocks
 
         parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
     if "costs" in result:
-        from ccd_casadi.reporting.structured_page import limits_blocks
+        from ccd_casadi.reporting.limit_figures import limits_blocks
 
         limits = "What limits the bandwidth"
         parts["limits"] = lambda: [c.Chapter(limits, limits_blocks(problem, result))]
@@ -191,7 +191,7 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     if "proof" in result:
-        from ccd_casadi.reporting.structured_page import binding_words
+        from ccd_casadi.reporting.limit_figures import binding_words
 
         rows, bound = facts("structured", problem, result), binding_words(problem, result)
     else:

@@ -13,7 +13,7 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.decision import lines_of, worst_state
+from ccd_casadi.reporting.concerns import lines_of, worst_state
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths

@@ -23,7 +23,7 @@ from ccd_casadi.deployment.on_hardware import forward_of, move, on_hardware
 from ccd_casadi.deployment.outcome import Deployment, deployed_line
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.source_code import COMPILE, write_c
-from ccd_casadi.extensions.formats.structured_text import structured_text
+from ccd_casadi.extensions.formats.code_formats import structured_text
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.ports import course

@@ -35,8 +35,7 @@ from ccd_casadi.extensions.rib_stage.model import (
 )
 from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
 from ccd_casadi.extensions.rib_stage.stage_modes import functionals, groups_of, spectrum
-from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material, StageError
 from ccd_casadi.plants.plant import Mechanics
 
 Array = np.ndarray

@@ -42,8 +42,12 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.analysis.setpoint import setpoint
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-    from ccd_casadi.extensions.feedforward.feedforward_files import entry, summary, write_code
-    from ccd_casadi.extensions.feedforward.feedforward_page import feedforward_page
+    from ccd_casadi.extensions.feedforward.feedforward_files import (
+        entry,
+        feedforward_page,
+        summary,
+        write_code,
+    )
     from ccd_casadi.extensions.feedforward.set_feedforward import (
         FeedforwardSetOptions,
         profile_of,

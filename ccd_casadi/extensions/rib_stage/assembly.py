@@ -8,7 +8,7 @@ from scipy import sparse
 
 from ccd_casadi.extensions.rib_stage.geometry import Point
 from ccd_casadi.extensions.rib_stage.mesh import PAIRS, Block, Mesh, cube_mass, cube_stiffness
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.support.arrays import Array
 
 

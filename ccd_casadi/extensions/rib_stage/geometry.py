@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.support.arrays import Array
 
 NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from ccd_casadi.extensions.rib_stage.geometry import IS_RIB, Geometry, axis_lengths, height_lengths
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.support.arrays import Array
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

@@ -32,7 +32,7 @@ from ccd_casadi.extensions.rib_stage.stage_modes import (
     heights,
     spectrum,
 )
-from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.finite_elements import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side

@@ -46,7 +46,7 @@ from ccd_casadi.extensions.rib_stage.stage_modes import (
     sector_of,
     spectrum,
 )
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side

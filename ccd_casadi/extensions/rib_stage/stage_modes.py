@@ -30,14 +30,14 @@ from ccd_casadi.extensions.rib_stage.assembly import (
 )
 from ccd_casadi.extensions.rib_stage.geometry import Geometry, Point, PointMass, has_square_symmetry
 from ccd_casadi.extensions.rib_stage.mesh import MeshOrder, build_mesh
-from ccd_casadi.plants.eigenpairs import (
+from ccd_casadi.plants.finite_elements import (
+    Material,
     Pencil,
     build_pencil,
     build_resolvent,
     flexible_modes,
     orthonormal,
 )
-from ccd_casadi.plants.material import Material
 from ccd_casadi.support.arrays import Array
 
 

@@ -21,9 +21,8 @@ from ccd_casadi.extensions.rib_stage.model import (
 )
 from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
 from ccd_casadi.plants.differenced import remembered
-from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.finite_elements import Material, StageError
 from ccd_casadi.plants.fixed_parameters import with_fixed
-from ccd_casadi.plants.material import Material
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 

@@ -32,10 +32,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         Schedule,
         entry,
         kept_at_positions,
+        schedule_page,
         summary,
         write_code,
     )
-    from ccd_casadi.extensions.schedule.schedule_page import schedule_page
     from ccd_casadi.extensions.schedule.segments import ScheduleOptions, scheduled_name, segments_of
     from ccd_casadi.inner_problem.structured_problem import structured_of
     from ccd_casadi.support.json_files import write_json

@@ -29,8 +29,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         design_for_share,
         price_answer,
         share_answer,
+        tolerance_case,
     )
-    from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.errors import UserError
