@@ -30,9 +30,8 @@ DRAWING = (
 EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.budget.evaluation": ("COMPLEX_STEP",),
     "ccd_casadi.budget.error_density": ("_X", "_W", "_G", "NODES", "KRONROD", "GAUSS"),
-    "ccd_casadi.extensions.rib_stage.assembly": ("COPIES",),
+    "ccd_casadi.extensions.rib_stage.assembly": ("COPIES", "PAIRS"),
     "ccd_casadi.extensions.rib_stage.geometry": ("LOWER", "UPPER"),
-    "ccd_casadi.extensions.rib_stage.mesh": ("PAIRS",),
     "ccd_casadi.extensions.rib_stage.model": ("ROWS",),
     "ccd_casadi.extensions.rib_stage.reduced": ("RIGID",),
     "ccd_casadi.cases.checks": ("LARGEST", "SMALLEST"),

@@ -13,6 +13,7 @@ import numpy as np
 
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.final_judgement import survived
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.structured_entries import active_of, box_findings, design_dict
@@ -332,3 +333,14 @@ def steepest_descent(
     design = None if answer is None else answer.design
     seconds = perf_counter() - began
     return Descent(gradient, tuple(start), first_step, tuple(history), design, stop, spent, seconds)
+
+
+def run_entry(descent: Descent) -> dict[str, Any]:
+    """How a descent began, and how it ended."""
+    return {
+        "gradient": descent.gradient.value,
+        "start": descent.start,
+        "first_step": descent.first_step,
+        "stop": descent.stop.value,
+        "iterations": len(descent.iterates),
+    }

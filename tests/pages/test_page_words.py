@@ -33,7 +33,7 @@ from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
 from ccd_casadi.reporting.nyquist import drawable, nyquist_panel
 from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.run_verdict import head_of, run_head
-from ccd_casadi.studies.comparison import conclusions
+from ccd_casadi.studies.compare_page import conclusions
 from ccd_casadi.support.text import HZ
 
 

@@ -9,23 +9,21 @@ import pytest
 from oracles.helpers import HZ
 
 from ccd_casadi.extensions.rib_stage.geometry import (
+    COARSE,
+    FINE,
     LOWER,
     UPPER,
     Geometry,
-    PointMass,
-    has_square_symmetry,
-    mass_properties,
-    rigid_fields,
-    rigid_values,
-)
-from ccd_casadi.extensions.rib_stage.mesh import (
-    COARSE,
-    FINE,
     Mesh,
     MeshOrder,
+    PointMass,
     build_mesh,
+    has_square_symmetry,
     line_nodes,
+    mass_properties,
     plain,
+    rigid_fields,
+    rigid_values,
 )
 from ccd_casadi.extensions.rib_stage.model import (
     ModeCount,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.geometry import COARSE
 from ccd_casadi.extensions.rib_stage.model import RibStage, modes_at, orthonormal_directions
 from ccd_casadi.plants.finite_elements import StageError
 from ccd_casadi.support.worker_process import threads_permitted

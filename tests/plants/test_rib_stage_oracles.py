@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import eigsh
 
-from ccd_casadi.extensions.rib_stage.mesh import plain
+from ccd_casadi.extensions.rib_stage.geometry import plain
 from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.plants.finite_elements import Material
 

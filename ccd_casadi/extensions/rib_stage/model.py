@@ -15,12 +15,12 @@ from ccd_casadi.extensions.rib_stage.assembly import AS, SA
 from ccd_casadi.extensions.rib_stage.geometry import (
     RIGID_NAMES,
     Geometry,
+    MeshOrder,
     Point,
     has_square_symmetry,
     rigid_fields,
     rigid_values,
 )
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder
 from ccd_casadi.extensions.rib_stage.stage_modes import (
     Discretisation,
     Group,

@@ -22,8 +22,13 @@ from scipy import sparse
 from scipy.linalg import block_diag, eigh
 
 from ccd_casadi.extensions.rib_stage.assembly import AS, mirror_signs, swap_displacements
-from ccd_casadi.extensions.rib_stage.geometry import LOWER, UPPER, Point, has_square_symmetry
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import (
+    LOWER,
+    UPPER,
+    MeshOrder,
+    Point,
+    has_square_symmetry,
+)
 from ccd_casadi.extensions.rib_stage.model import (
     TWENTY,
     RibStage,

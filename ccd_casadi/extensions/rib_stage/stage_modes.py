@@ -28,8 +28,14 @@ from ccd_casadi.extensions.rib_stage.assembly import (
     point_functional,
     swap_displacements,
 )
-from ccd_casadi.extensions.rib_stage.geometry import Geometry, Point, PointMass, has_square_symmetry
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder, build_mesh
+from ccd_casadi.extensions.rib_stage.geometry import (
+    Geometry,
+    MeshOrder,
+    Point,
+    PointMass,
+    build_mesh,
+    has_square_symmetry,
+)
 from ccd_casadi.plants.finite_elements import (
     Material,
     Pencil,

@@ -9,8 +9,15 @@ import casadi as ca
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.extensions.rib_stage import reduced
-from ccd_casadi.extensions.rib_stage.geometry import NAMES, Geometry, Point, PointMass
-from ccd_casadi.extensions.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import (
+    COARSE,
+    FINE,
+    NAMES,
+    Geometry,
+    MeshOrder,
+    Point,
+    PointMass,
+)
 from ccd_casadi.extensions.rib_stage.model import (
     FORTY_FOUR,
     OUTPUTS,
