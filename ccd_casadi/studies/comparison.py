@@ -1,7 +1,4 @@
-"""Every method side by side on one case, and the sequential design: hardware of least cost f(θ) first.
-
-The hardware of the sequential way is the cheapest whose first resonance meets a rule of thumb.
-"""
+"""Methods side by side on one case; hardware of least cost f(θ) first in the sequential one."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace

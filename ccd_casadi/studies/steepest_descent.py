@@ -13,7 +13,6 @@ import numpy as np
 
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.final_judgement import survived
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.structured_entries import active_of, box_findings, design_dict

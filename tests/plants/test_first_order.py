@@ -18,7 +18,7 @@ from oracles.wired_plants import first_order_system, machine
 from scipy.linalg import block_diag
 
 from ccd_casadi import inner
-from ccd_casadi.cases.diagnosis import _driven_away
+from ccd_casadi.cases.plant_findings import _driven_away
 from ccd_casadi.fixed_structure.channel_structure import find_decoupling, is_decoupled
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
