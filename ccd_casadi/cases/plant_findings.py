@@ -1,4 +1,4 @@
-"""What a plant shows by itself: transmission zeros, signs, lags, entries, rigid and hidden modes."""
+"""What a plant shows by itself: transmission zeros, signs, lags, entries, rigid, hidden modes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
