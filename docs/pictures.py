@@ -36,8 +36,8 @@ RUNS = {  # folder of a run: its commands without `ccd`
 }
 DRAWN = ("drawing/*.py", "drawing/assets/*.css", "drawing/assets/page.html",
          "drawing/assets/blocks.html", "drawing/assets/lumped.svg")  # fmt: skip
-GLANCE = ("solve_page", "structured_page", "decision", "facts", "run_verdict", "gain_figures",
-          "nyquist", "machine", "moves")  # fmt: skip
+GLANCE = ("solve_page", "limit_figures", "decision", "concerns", "facts", "run_verdict",
+          "gain_figures", "nyquist", "machine", "moves")  # fmt: skip
 
 
 @dataclass(frozen=True)
