@@ -16,7 +16,7 @@ LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/extensions/cluster/d
 PROCESSES = {
     ("ccd_casadi/extensions/formats/code_formats.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/extensions/explorer/session.py", "subprocess.Popen"),
+    ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }

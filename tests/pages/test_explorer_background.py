@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from queue import Queue
 
-from ccd_casadi.extensions.explorer.session import Background, Solve
+from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.worker_process import WorkerLost
 
