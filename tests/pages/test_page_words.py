@@ -24,7 +24,8 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.reporting.decision import LINES, advice
+from ccd_casadi.reporting.concerns import LINES
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import facts, theta_table, theta_words
 from ccd_casadi.reporting.gain_figures import above
 from ccd_casadi.reporting.insight_page import front_answer
