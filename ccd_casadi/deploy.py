@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment import Timing
-from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_limits
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError

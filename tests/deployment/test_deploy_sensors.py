@@ -29,7 +29,7 @@ from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.ports import course
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.robust.demands import Demands
+from ccd_casadi.robust import Demands
 from ccd_casadi.robust.perturbed import judge
 from ccd_casadi.robust.study import robustness
 from ccd_casadi.support.errors import UserError

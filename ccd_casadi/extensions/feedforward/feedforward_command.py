@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, one_line, option, valued
