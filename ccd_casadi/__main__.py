@@ -89,7 +89,7 @@ def _refuse(words: str) -> int:
 
 
 def _schema() -> ModuleType:
-    return import_module("ccd_casadi.cases.schema")  # loads the models of the package
+    return import_module("ccd_casadi.cases.case")  # loads the models of the package
 
 
 def new(folder: Path) -> int:

@@ -10,8 +10,8 @@ from difflib import unified_diff
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import write_page
 from ccd_casadi.reporting.concerns import lines_of

@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_channels import scalar_channels
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, axis_label

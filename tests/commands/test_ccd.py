@@ -19,9 +19,8 @@ import pytest
 
 from ccd_casadi import robust
 from ccd_casadi.__main__ import ALIASES, OWN, commands, main, overview
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import CaseError, case_schema, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.support import extensions

@@ -13,10 +13,9 @@ import pytest
 import scipy
 from oracles.case_documents import QUICK_SECTIONS
 
-from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.case import case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.deployment.robust_set import members
 from ccd_casadi.extensions.tolerances import answers, prices, share_search
 from ccd_casadi.extensions.tolerances.answers import tolerance_case

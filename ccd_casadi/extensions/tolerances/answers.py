@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulations import formulation_of, usual_name
 from ccd_casadi.codesign.reasons import Reason
