@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
-from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.drawing.content import (
     Block,
     Chapter,
@@ -36,12 +35,12 @@ from ccd_casadi.synthesis.closed_loop import measure
 if TYPE_CHECKING:
     from ccd_casadi.budget.evaluation import BudgetFigures
     from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-
+    from ccd_casadi.codesign.verified_structured import VerifiedStructured
 
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
 
 
-def bandwidths_table(verified: VerifiedStructured) -> Table:
+def bandwidths_table(verified: "VerifiedStructured") -> Table:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
