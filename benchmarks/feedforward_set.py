@@ -16,8 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.extensions.feedforward.learning import learned, learning_gain, least_error
-from ccd_casadi.extensions.feedforward.move_responses import responses_of
+from ccd_casadi.extensions.feedforward.move_responses import (
+    learned,
+    learning_gain,
+    least_error,
+    responses_of,
+)
 from ccd_casadi.extensions.feedforward.set_feedforward import profile_of, set_feedforward
 from ccd_casadi.solve import main as solve_main
 

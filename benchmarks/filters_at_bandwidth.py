@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.analysis.loop_warnings import bandwidth_dip
-from ccd_casadi.cases.case import load_case, parse_theta
+from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import SectionsDesign

@@ -32,12 +32,9 @@ import numpy as np
 from ccd_casadi.cases.case import load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.extensions.tolerances.answers import design_for_share, share_answer
-from ccd_casadi.extensions.tolerances.machines import Plan
-from ccd_casadi.extensions.tolerances.prices import prices, scaled
-from ccd_casadi.extensions.tolerances.share_certificate import certified_share
-from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
-from ccd_casadi.extensions.tolerances.widths import buy
+from ccd_casadi.extensions.tolerances.answers import design_for_share, share_answer, tolerance_case
+from ccd_casadi.extensions.tolerances.machines import Plan, certified_share
+from ccd_casadi.extensions.tolerances.prices import buy, prices, scaled
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared

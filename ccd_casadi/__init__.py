@@ -10,14 +10,14 @@ Names are imported when they are first used: this module alone loads neither num
 
 import sys as _sys
 
-from ccd_casadi.support import interrupts as _interrupts
+from ccd_casadi.support import errors as _errors
 from ccd_casadi.support.terminal import NotebookHtml
 from surrogates.lazy_names import from_stub as _from_stub
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _interrupts.exit_on_ctrl_c()
+    _errors.exit_on_ctrl_c()
 
-del _interrupts
+del _errors
 
 __all__ = [*_from_stub(__name__), "__version__"]
 

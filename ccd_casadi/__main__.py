@@ -9,7 +9,7 @@ from types import ModuleType
 
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import ExitCode
-from ccd_casadi.support.interrupts import raise_on_ctrl_c
+from ccd_casadi.support.errors import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.text import package_text, template
@@ -89,7 +89,7 @@ def _refuse(words: str) -> int:
 
 
 def _schema() -> ModuleType:
-    return import_module("ccd_casadi.cases.schema")  # loads the models of the package
+    return import_module("ccd_casadi.cases.case")  # loads the models of the package
 
 
 def new(folder: Path) -> int:

@@ -17,9 +17,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.cases.diagnosis import diagnose
+    from ccd_casadi.cases.diagnosis import PlantReportOptions, diagnose, plant_report
     from ccd_casadi.cases.findings import Severity
-    from ccd_casadi.cases.plant_report import PlantReportOptions, plant_report
     from ccd_casadi.reporting.facts import theta_words
     from ccd_casadi.support.json_files import json_text, json_values, write_json
     from ccd_casadi.support.text import template

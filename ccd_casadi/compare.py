@@ -38,8 +38,9 @@ def table(comparison: "Comparison") -> str:
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.schema import case_to_toml
-    from ccd_casadi.studies.comparison import compare, comparison_dict
+    from ccd_casadi.cases.case import case_to_toml
+    from ccd_casadi.studies.compare_page import comparison_dict
+    from ccd_casadi.studies.comparison import compare
     from ccd_casadi.studies.steepest_descent import case_to_compare
     from ccd_casadi.support.json_files import write_json
 

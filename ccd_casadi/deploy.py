@@ -2,11 +2,11 @@
 
 import argparse
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment import Timing
-from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_limits
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.cases.run_folder import FinishedRun
     from ccd_casadi.deployment.on_hardware import OnHardware
     from ccd_casadi.deployment.outcome import Deployment
+    from ccd_casadi.lti.loop import Sampling
 
 
 def _delay(arguments: argparse.ArgumentParser) -> None:
@@ -66,11 +67,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment import source_code
     from ccd_casadi.deployment.deploy_files import DESIGN_FILES, write_files
     from ccd_casadi.deployment.fixed_point import FixedRequest
-    from ccd_casadi.deployment.integer_words import integer_faults
+    from ccd_casadi.deployment.integer_loop import integer_faults
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
-    from ccd_casadi.deployment.timing_words import shortfall_words
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
@@ -162,10 +162,9 @@ def main(options: argparse.Namespace) -> ExitCode:
 
 
 def _summary(run: "FinishedRun", found: "Deployment", moved: "OnHardware | None") -> str:
-    from ccd_casadi.deployment.integer_words import integer_words
+    from ccd_casadi.deployment.integer_loop import integer_words
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.timing_words import needed_words
     from ccd_casadi.reporting.decision import advice
     from ccd_casadi.support.text import template
 
@@ -174,6 +173,90 @@ def _summary(run: "FinishedRun", found: "Deployment", moved: "OnHardware | None"
         needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
         integers=integer_words(found.realisation.fixed, found.rounding, moved),
     ).rstrip()  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TimingWordsOptions:
+    """Numbers of the comparison with the design.
+
+    Attributes
+    ----------
+    same : float
+        Relative difference of two rates or delays up to which they are the same.
+    """
+
+    same: float = 1e-9
+
+
+def needed_words(found: "Deployment") -> str:
+    """What the loop was designed for, or the least rate that it needs.
+
+    Parameters
+    ----------
+    found : Deployment
+
+    Returns
+    -------
+    str
+        A few words, after the rate and the delay.
+    """
+    if found.designed is not None:
+        return f"designed for {_own(found.designed)}"
+    if found.needed_hz is None:
+        return "no rate will do"
+    return f"needed {found.needed_hz:.5g} Hz"
+
+
+def shortfall_words(found: "Deployment") -> str:
+    """What is not kept, why, and what to change.
+
+    Parameters
+    ----------
+    found : Deployment
+        Not passed.
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    if not found.shortfalls:
+        return f"the run itself is not: {found.unverified}"
+    missed, needed = found.shortfalls[0], found.needed_hz
+    if found.designed is not None:
+        at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
+        return f"{at}: {missed}; {_of_design(found, found.designed)}"
+    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
+    if needed is None:
+        return f"{rate} is not enough: {missed}; with this delay no rate is; shorten the delay"
+    if found.rate_hz < needed:
+        return f"{rate} is not enough: {missed}; {needed:.6g} Hz is needed"
+    # the plants of the case's set allow this rate; one between them, or the judge, does not
+    return f"{rate}: {missed}; leave out --rate-hz, or give one above {found.rate_hz:.6g} Hz"
+
+
+def _own(designed: "Sampling") -> str:
+    return f"{designed.rate_hz:.6g} Hz and {designed.delay_us:.4g} us"
+
+
+def _of_design(
+    found: "Deployment", designed: "Sampling", options: TimingWordsOptions = TimingWordsOptions()
+) -> str:
+    """How the loop runs otherwise than it was designed to, and the remedy of that."""
+    more, causes, keys = 1.0 + options.same, [], []
+    if found.rate_hz * more < designed.rate_hz:
+        causes.append(f"the rate is below the {designed.rate_hz:.6g} Hz")
+        keys.append(f"loop.rate_hz = {found.rate_hz:.6g}")
+    if found.delay > more * designed.delay:
+        causes.append(f"the delay exceeds the {designed.delay_us:.4g} us")
+        keys.append(f"loop.delay_us = {1e6 * found.delay:.4g}")
+    if causes:
+        why, write = " and ".join(causes), " and ".join(keys)
+        return f"{why} of the design: keep to the design, or write {write} in the case and solve it"
+    same = found.rate_hz <= more * designed.rate_hz and more * found.delay >= designed.delay
+    if same:
+        return "the loop runs as it was designed: solve the case again"
+    return f"it was designed for {_own(designed)}: keep to these"
 
 
 if __name__ == "__main__":

@@ -30,10 +30,11 @@ PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
-    from ccd_casadi.cases.case import CaseError, load_case, parse_theta
+    from ccd_casadi.cases.case import CaseError, load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.diagnosis import suspicions
     from ccd_casadi.cases.measured_case import measured_case
+    from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
     from ccd_casadi.inner_problem.structured_problem import StructuredProblem

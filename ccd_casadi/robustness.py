@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ccd_casadi.robust.demands import MOVE_OPTIONS, Demands, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, Demands, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, option, positive, real, valued

@@ -95,8 +95,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         for words in peak_words(problem.inner.S_max):
             say(f"warning: {words}", sys.stderr)
         return
-    from ccd_casadi.cases.diagnosis import diagnose, first_seen
-    from ccd_casadi.cases.plant_report import size_words
+    from ccd_casadi.cases.diagnosis import diagnose, first_seen, size_words
 
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
     if sizes := size_words(facts[0], case):

@@ -36,8 +36,8 @@ RUNS = {  # folder of a run: its commands without `ccd`
 }
 DRAWN = ("drawing/*.py", "drawing/assets/*.css", "drawing/assets/page.html",
          "drawing/assets/blocks.html", "drawing/assets/lumped.svg")  # fmt: skip
-GLANCE = ("solve_page", "structured_page", "decision", "facts", "run_verdict", "gain_figures",
-          "nyquist", "machine", "moves")  # fmt: skip
+GLANCE = ("solve_page", "limit_figures", "decision", "concerns", "facts", "run_verdict",
+          "gain_figures", "nyquist", "machine", "moves")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ SHOTS = {
                              "templates/deploy.txt")),
     "report": Shot("built", "report.html", 1240, REPORT),
     "tune": Shot("tuned", "report.html", 900,
-                 (*DRAWN, "extensions/measured/measured_page.py", "reporting/gain_figures.py",
+                 (*DRAWN, "extensions/measured/measured_answer.py", "reporting/gain_figures.py",
                   "reporting/nyquist.py")),
     "insight": Shot("front", "insight.html", 945,
                     (*reporting("insight_page", "decision", "run_verdict"),

@@ -3,7 +3,7 @@
 The one module here that knows of control; nothing of the package imports it.
 """
 
-from ccd_casadi.support.interrupts import exit_on_ctrl_c
+from ccd_casadi.support.errors import exit_on_ctrl_c
 
 if __name__ == "__main__":
     exit_on_ctrl_c()

@@ -1,13 +1,15 @@
-"""What is wrong, or worth knowing, with a plant before anything is designed for it.
+"""What is wrong, or worth knowing, with a plant before a design; and the report of it by `check`.
 
-A plant is looked at in the start of θ, the middle and the corners of the box. Errors are what no
+A plant is checked at the start of θ, the middle and the corners of the box. Errors are what no
 design can be made with; warnings what a designer must know; notes what explains the bandwidth.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -15,23 +17,25 @@ from ccd_casadi.cases.findings import (
     CaseFinding,
     Severity,
     Topic,
+    plausibility_findings,
+    unit_findings,
+)
+from ccd_casadi.cases.plant_findings import (
+    DiagnosisOptions,
+    driven_away_findings,
     entry_findings,
+    hidden_findings,
     loop_findings,
     most_limiting,
-    unit_findings,
+    outside_findings,
+    rigid_findings,
     zero_findings,
 )
-from ccd_casadi.cases.plausibility import plausibility_findings
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import with_ranges
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.plants.modal import (
-    ModalPlant,
-    Suspension,
-    modal_plant,
-    require_damping,
-    without_hidden_rigid_modes,
-)
+from ccd_casadi.plants.modal import modal_plant, require_damping, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import (
     Mechanics,
     Plant,
@@ -45,29 +49,7 @@ from ccd_casadi.plants.plant_facts import PlantFacts, facts_of
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.terminal import Progress
-from ccd_casadi.support.text import HZ
-
-
-@dataclass(frozen=True)
-class DiagnosisOptions:
-    """Numbers of the diagnosis of a plant.
-
-    Attributes
-    ----------
-    most_corners : int
-        Corners of the box; of more this many are drawn.
-    with_derivatives : int
-        Points at which derivatives by differences are checked: start and middle.
-    hidden : float
-        Share of the largest gain below which a mode is not driven, or not measured.
-    coupled : float
-        Share of the modes' damping above which a damper connects two modes.
-    """
-
-    most_corners: int = 16
-    with_derivatives: int = 2
-    hidden: float = 1e-6
-    coupled: float = 1e-9
+from ccd_casadi.support.text import is_force, number, of_newtons, spoken
 
 
 def points_to_check(
@@ -122,7 +104,7 @@ def diagnose(
         problem = with_ranges(problem)
     plant = plant_of(problem)
     facts: list[PlantFacts] = []
-    findings = list(_outside(problem, plant))
+    findings = list(outside_findings(problem, plant))
     if findings:
         return (), tuple(findings)
     points = points_to_check(problem, seed, options=options)
@@ -146,10 +128,10 @@ def diagnose(
                 else ""
             )
             here = [CaseFinding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
-            here += _rigid(modal, problem.suspension, rigid_modes, place)
+            here += rigid_findings(modal, problem.suspension, rigid_modes, place)
             here += [
-                *_driven_away(found, modal.states is not None, place),
-                *_hidden(modal, place, options),
+                *driven_away_findings(found, modal.states is not None, place),
+                *hidden_findings(modal, place, options),
                 *zero_findings(found, problem.inner.S_max, place),
             ]
             if index == 0:
@@ -233,102 +215,125 @@ def first_seen(findings: Sequence[CaseFinding]) -> list[CaseFinding]:
     return sorted(kept, key=lambda item: list(Severity).index(item.severity))
 
 
-def _outside(problem: CoDesignProblem, plant: Plant) -> list[CaseFinding]:
-    unknown = plant.unknown_between
-    found = [CaseFinding(Severity.ERROR, Topic.BETWEEN, unknown)] if unknown else []
-    if plant.domain is None:
-        return found
-    box = zip(problem.names, problem.lower, problem.upper, *plant.domain, strict=True)
-    for name, low, high, least, most in box:
-        slack = 1e-9 * (most - least)
-        if low < least - slack or high > most + slack:
-            words = (
-                f"theta.{name}: its bounds {low:g} to {high:g} go beyond the model's samples, "
-                f"{least:g} to {most:g}; narrow them, or add samples"
-            )
-            found.append(CaseFinding(Severity.ERROR, Topic.DOMAIN, words))
-    return found
+@dataclass(frozen=True)
+class PlantReportOptions:
+    """Rules of thumb of the report.
+
+    Attributes
+    ----------
+    window : tuple of float
+        ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less
+        with resonances nearby.
+    shares : tuple of float
+        Bandwidths over the first resonance, for each of which an M_K is given.
+    """
+
+    window: tuple[float, float] = (0.4, 1.1)
+    shares: tuple[float, ...] = (0.2, 1.0 / 3.0, 0.5)
 
 
-def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[CaseFinding]:
-    """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
-    D = np.abs(modal.D - np.diag(np.diag(modal.D)))
-    coupled = (options.coupled * np.diag(modal.D).max() < D).any(axis=1)
-    k, rigid, found = np.diag(modal.K), modal.rigid, []
-    w = np.sign(k) * np.sqrt(np.abs(k))
-    # modes of one frequency, whose shapes are one space; the rigid ones are one
-    same = (rigid[1:] & rigid[:-1]) | (
-        ~rigid[:-1] & (np.abs(np.diff(w)) <= options.hidden * np.abs(w[1:]))
-    )
-    for group in np.split(np.arange(len(w)), np.flatnonzero(~same) + 1):
-        if coupled[group].any():
-            continue  # a damper hands its motion on to others
-        lacks = [
-            name
-            for name, gains in (("driven", modal.B), ("measured", modal.C.T))
-            if np.linalg.matrix_rank(gains[group], tol=options.hidden * np.abs(gains).max())
-            < len(group)
-        ]
-        if not lacks:
-            continue
-        missing = "not " + " and not ".join(lacks)
-        if rigid[group[0]]:
-            words = (
-                f"of {len(group)} rigid-body motions {place} one or more are {missing}: no "
-                "controller holds them, and they are left out of the loop; something else in the "
-                "machine has to"
-            )
-        elif k[group[0]] < 0.0:
-            words = (
-                f"a motion that the stiffness drives away {place} is {missing}: no controller "
-                "stabilises it; add an actuator that moves it and a sensor that sees it"
-            )
-            found.append(CaseFinding(Severity.ERROR, Topic.HIDDEN_MODE, words))
-            continue
-        else:
-            formal = {"driven": "uncontrollable", "measured": "unobservable"}
-            words = (
-                f"the mode at {w[group[0]] / HZ:.5g} Hz {place} is {missing} "
-                f"({', '.join(formal[name] for name in lacks)}): no controller damps it, and S "
-                "does not show it"
-            )
-        found.append(CaseFinding(Severity.WARNING, Topic.HIDDEN_MODE, words))
-    return found
+def plant_report(
+    case: Case,
+    problem: CoDesignProblem,
+    facts: Sequence[PlantFacts],
+    findings: Sequence[CaseFinding],
+    *,
+    options: PlantReportOptions = PlantReportOptions(),
+) -> dict[str, Any]:
+    """Write the diagnosis of a plant as plain values.
+
+    Parameters
+    ----------
+    case : Case
+    problem : CoDesignProblem
+        Of the case.
+    facts, findings : sequences
+        As `diagnose` returns them.
+    options : PlantReportOptions
+
+    Returns
+    -------
+    dict
+        Frequencies in Hz, M_K in N/m.
+    """
+    plant = plant_of(problem)
+    start = facts[0]
+    values = constraint_values(plant, problem.start)
+    constraints = zip(plant.constraint_names, values, strict=True)
+    start_of = dict(zip(problem.names, problem.start, strict=True))
+    between = any(start_of[name] not in values for name, values in problem.listed)
+    count = min(len(item.modes) for item in facts)
+    hertz = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
+    return {
+        "plant": case.plant.name,
+        "inputs": plant.inputs,
+        "outputs": plant.outputs,
+        "notes": list(plant.notes(problem.start)),
+        "theta": dict(zip(problem.names, problem.start, strict=True)),
+        "varies": {p.name: [p.lower, p.upper] for p in case.fixed if p.varies},
+        "units": {parameter.name: parameter.unit for parameter in case.theta},
+        "points": len(facts),
+        "size": size_words(start, case, options=options),
+        "inertia": start.inertia,
+        "rigid_modes": sum(mode.rigid for mode in start.modes),
+        "modes": [asdict(mode) for mode in start.modes],
+        # least and largest of the i-th mode in order of frequency, over the points
+        "frequency_ranges_hz": np.column_stack([hertz.min(axis=0), hertz.max(axis=0)]).tolist(),
+        "zeros": [asdict(zero) for zero in start.zeros],
+        "effort_hz": start.effort_hz,
+        "bandwidth_window_hz": [share * start.effort_hz for share in options.window],
+        "M_K": case.weights.M_K,
+        "M_K_for_bandwidth": _suitable(problem, start, options.shares),
+        "constraints": [
+            {"name": name, "value": float(value), "met": bool(value <= 0.0), "open": between}
+            for name, value in constraints
+        ],
+        "budget": [  # each source by the RMS of its spectrum; None where it is white
+            {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
+            for s in (problem.budget.sources if problem.budget else ())
+        ],
+        "findings": [
+            {"severity": f.severity.value, "topic": f.topic.value, "words": f.words}
+            for f in first_seen(findings)
+        ],
+    }
 
 
-def _driven_away(facts: PlantFacts, of_states: bool, place: str) -> list[CaseFinding]:
-    growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
-    if not growth:
-        return []
-    what = "the stiffness drives a motion away"
-    meant = "a spring was meant, correct the sign of stiffness"
-    if of_states:
-        what, meant = "A drives a motion away", "that is not meant, correct its signs"
-    words = (
-        f"{what} {place}: an unstable pole at +{growth:.4g} Hz, which "
-        f"the crossover has to exceed; if {meant}"
-    )
-    return [CaseFinding(Severity.NOTE, Topic.UNSTABLE, words)]
+def size_words(
+    facts: PlantFacts, case: Case, *, options: PlantReportOptions = PlantReportOptions()
+) -> str:
+    """Write how large a plant is, which shows at a glance that numbers are not in SI.
+
+    Parameters
+    ----------
+    facts : PlantFacts
+    case : Case
+    options : PlantReportOptions
+
+    Returns
+    -------
+    str
+    """
+    parts = []
+    if math.isfinite(facts.inertia) and is_force(case.units.input):
+        felt = spoken(f"the mass felt by an actuator is {facts.inertia:.3g} kg")
+        parts.append(felt + of_newtons(case.units.input))
+    flexible = [mode.frequency_hz for mode in facts.modes if mode.resonant]
+    parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
+    if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):
+        low, high = (share * facts.effort_hz for share in options.window)
+        parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
+    return ", ".join(parts)
 
 
-def _rigid(
-    modal: ModalPlant, suspension: Suspension, expected: int | None, place: str
-) -> list[CaseFinding]:
-    count = int(modal.rigid.sum())
-    flexible = modal.natural[~modal.rigid & ~modal.driven_away] / HZ
-    least = f"; the lowest frequency is {flexible[0]:.4g} Hz" if flexible.size else ""
-    if expected is not None and count != expected:
-        words = (
-            f"{count} rigid-body modes {place}, where suspension.rigid_modes expects "
-            f"{expected}{least}; correct the stiffness (K v = 0 for a rigid-body motion v), or "
-            "suspension.rigid_modes"
-        )
-        return [CaseFinding(Severity.ERROR, Topic.RIGID_MODES, words)]
-    slow = flexible[flexible < 10.0 * suspension.frequency_hz]
-    if count and slow.size:
-        words = (
-            f"a flexible mode at {slow[0]:.3g} Hz {place} lies next to the suspension's "
-            f"{suspension.frequency_hz:g} Hz: is it a rigid-body mode that K holds by mistake?"
-        )
-        return [CaseFinding(Severity.WARNING, Topic.RIGID_MODES, words)]
-    return []
+def _suitable(
+    problem: CoDesignProblem, start: PlantFacts, shares: tuple[float, ...]
+) -> list[dict[str, float]]:
+    """M_K that moves `effort_hz` to shares of the first resonance, below which G falls as ω⁻²."""
+    first = next((mode.frequency_hz for mode in start.modes if mode.resonant), math.nan)
+    M_K, effort = problem.weights.M_K, start.effort_hz
+    return [
+        {"bandwidth_hz": share * first, "M_K": M_K * (share * first / effort) ** 2}
+        for share in shares
+        if math.isfinite(first / effort) and start.modes[0].rigid
+    ]

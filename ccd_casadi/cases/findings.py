@@ -1,26 +1,25 @@
-"""What is told of a plant before anything is designed for it: severity, topic, one sentence.
+"""What is said of a plant before anything is designed for it: severity, topic, one sentence.
 
-What its transmission zeros say about the bandwidth, and numbers that look like those of another
-unit: M_K, stiffness, S_max, told by name. For these frequencies are compared that a consistent case
-has close together: where the plant falls through 1/M_K, its first resonance, and where [inner]
-looks.
+Here are the findings of numbers that look like those of another unit: M_K, stiffness, S_max, by
+name. For these frequencies are compared that a consistent case has close together: where the plant
+falls through 1/M_K, its first resonance, and where [inner] looks. Questions about a motor, a move
+and S_low, never a refusal, compare a number of the case with what the plant has, or with the limits
+of machines that exist: a number in another unit is a factor of 1000 away.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
+from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.state_space import sigma_max
-from ccd_casadi.plants.modal import ModalPlant
-from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
+from ccd_casadi.plants.plant_facts import PlantFacts
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ, is_force, of_newtons, spoken
 
 
@@ -61,10 +60,6 @@ class FindingOptions:
     blind: float = 1e-9
 
 
-# in SI, by how a person writes them
-MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
-STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, "N/mm": 1e3,
-             "N/m": 1.0}  # fmt: skip
 SI = "all values are in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
 
 
@@ -106,50 +101,6 @@ class CaseFinding:
     limit_hz: float = np.inf
 
 
-def zero_findings(
-    facts: PlantFacts, S_max: float, place: str, *, options: FindingOptions = FindingOptions()
-) -> list[CaseFinding]:
-    """The right half-plane zero that limits most, and the dips; `place` names the θ."""
-    found = []
-    right = [zero for zero in facts.zeros if zero.damping_ratio < 0.0]
-    if right:
-        found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
-    return found + [
-        _dip(zero, place) for zero in facts.zeros if 0.0 <= zero.damping_ratio < options.light
-    ]
-
-
-def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> CaseFinding:
-    z, limit = zero.frequency_hz, bandwidth_limit_hz(zero, S_max)
-    words = (
-        f"a transmission zero in the right half-plane at {z:.4g} Hz {place}: with a peak of S of "
-        f"{S_max:g} no bandwidth above {limit:.3g} Hz is possible there (Poisson integral), and "
-        f"well before it, from about {0.5 * z:.3g} Hz on, robustness is lost; move sensor and "
-        "actuator closer together"
-    )
-    severity = Severity.WARNING if z < 2.0 * facts.effort_hz else Severity.NOTE
-    return CaseFinding(severity, Topic.ZERO, words, limit_hz=limit)
-
-
-def _dip(zero: Zero, place: str) -> CaseFinding:
-    words = f"an anti-resonance (transmission zero) at {zero.frequency_hz:.4g} Hz {place}, "
-    if zero.dip < FindingOptions.blind:
-        words += "undamped, caps the bandwidth there: no force moves the sensor at it"
-    else:
-        words += (
-            f"damping {100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through "
-            f"it needs {1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
-        )
-    return CaseFinding(Severity.NOTE, Topic.ZERO, words)
-
-
-def most_limiting(findings: Sequence[CaseFinding]) -> list[CaseFinding]:
-    """All findings, of the right half-plane warnings only that with the lowest limit."""
-    severe = [f for f in findings if f.severity is Severity.WARNING and f.limit_hz < np.inf]
-    worst = min(severe, key=lambda f: f.limit_hz, default=None)
-    return [f for f in findings if f is worst or f not in severe]
-
-
 def unit_findings(
     problem: CoDesignProblem,
     facts: PlantFacts,
@@ -166,81 +117,6 @@ def unit_findings(
     return [CaseFinding(Severity.WARNING, Topic.UNITS, item) for item in words]
 
 
-def loop_findings(
-    problem: CoDesignProblem,
-    facts: PlantFacts,
-    modal: ModalPlant,
-    *,
-    options: FindingOptions = FindingOptions(),
-) -> list[CaseFinding]:
-    """Warnings about signs of sensors and actuators, and about the delay and the rate of the
-    loop."""
-    words = _sign_words(problem, modal) + _unit_words(problem, modal, options)
-    growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
-    if (run := problem.sampling) is not None:
-        meant = facts.effort_hz if states_effort(problem) else np.nan
-        words += _lag_words(run, meant, options)
-        words += _unstable_words(run, growth, problem.inner.S_max)
-    return [CaseFinding(Severity.WARNING, Topic.LOOP, item) for item in words]
-
-
-def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
-    """Of each channel whose sensor a positive force moves to negative values, but for `nothing` of
-    what its modes could; of the directions that a design finds itself signs are known."""
-    p, m = len(modal.C), modal.B.shape[1]
-    controller = problem.controller
-    given = controller.channels if isinstance(controller, StructuredProblem) else ()
-    if p == 1 == m:
-        pairs = [("the sensor", np.ones(1), np.ones(1))]
-    elif given and given[0].outputs is not None:
-        pairs = [(f"the sensor of channel {one.name}", np.array(one.outputs),
-                  np.ones(1) if m == 1 else np.array(one.inputs)) for one in given]  # fmt: skip
-    else:  # each sensor alone where they share the actuator
-        pairs = [(f"the sensor of output {i + 1}", row, np.ones(1))
-                 for i, row in enumerate(np.eye(p)) if m == 1]  # fmt: skip
-    rigid, away = modal.rigid, bool(modal.driven_away.any())
-    pushed = None if modal.states is None else modal.states.pushed
-    words = []
-    for sensor, out, into in pairs:
-        gains = (out @ modal.C) * (modal.B @ into)
-        # of a free or driven-away body as it accelerates, else at rest
-        moved = gains[rigid] if rigid.any() else gains if away else gains / np.diag(modal.K)
-        if pushed is not None:
-            moved = np.atleast_1d(out @ pushed @ into)
-        largest = np.linalg.norm(out @ modal.C) * np.linalg.norm(modal.B @ into)
-        if not largest > 0.0:
-            words.append(
-                f"{sensor} reads nothing that the actuator moves: no design is made with it; "
-                "correct its row of output, or leave it out"
-            )
-        if pushed is not None:
-            largest = np.minimum(largest, np.abs(pushed).max())
-        elif not rigid.any() and not away:
-            largest /= float(np.abs(np.diag(modal.K)).max())
-        if moved.sum() < -nothing * largest:
-            words.append(
-                f"a positive force moves {sensor} to negative values, so that a controller of "
-                "positive gain is unstable: is the sign of output or input as it is wired? "
-                "If not, correct the row or the column"
-            )
-    return words
-
-
-def _unit_words(problem: CoDesignProblem, modal: ModalPlant, options: FindingOptions) -> list[str]:
-    """Whether sensors on one actuator read in one unit, where one bound is on all their gains."""
-    if modal.B.shape[1] != 1 or len(modal.C) < 2 or not states_effort(problem):
-        return []
-    sizes = np.linalg.norm(modal.C, axis=1)
-    least, most = int(sizes.argmin()), int(sizes.argmax())
-    if not sizes[most] > options.unlike * sizes[least] > 0.0:
-        return []
-    return [
-        f"output {most + 1} moves {sizes[most] / sizes[least]:.3g} times as far as output "
-        f"{least + 1}: do they have one unit? weighted_level bounds KS of all sensors together, "
-        "so scale each row of output to the same unit (a motor's angle by the lead over 2 pi)"
-    ]
-
-
 def states_effort(problem: CoDesignProblem) -> bool:
     """Whether the case has an M_K; sections without weighted_level are scaled by one of ours.
 
@@ -254,73 +130,6 @@ def states_effort(problem: CoDesignProblem) -> bool:
     """
     kind = kind_of(problem)
     return not kind.as_designed or kind.bounds().weighted_level is not None
-
-
-def _lag_words(run: Sampling, meant: float, options: FindingOptions) -> list[str]:
-    """Whether delay and rate are in other units, `meant` in Hz being what M_K suits."""
-    words, seconds, period = [], run.delay_us, run.period
-    short = 0.0 < run.delay < options.least_delay * period
-    if short and seconds < options.most_delay * period:
-        words.append(
-            f"loop.delay_us = {run.delay_us:g} is {1e9 * run.delay:.3g} ns: were seconds meant? "
-            f"Then write {1e6 * seconds:g}"
-        )
-    lag = run.delay + 0.5 * period
-    limit = 1.0 / (HZ * lag)
-    if meant > options.mismatch * limit:
-        why = f"delay_us = {run.delay_us:g} and rate_hz = {run.rate_hz:g}"
-        hint = "rate_hz is in Hz" if run.delay < 0.5 * period else "delay_us is in microseconds"
-        words.append(
-            f"loop: {why} delay the force by {1e3 * lag:.3g} ms, which leaves no bandwidth above "
-            f"some {limit:.2g} Hz, and M_K suits {meant:.3g} Hz: {hint}"
-        )
-    return words
-
-
-def _unstable_words(run: Sampling, growth_hz: float, S_max: float) -> list[str]:
-    """Whether a pole is too fast for the loop's delay.
-
-    At a pole p of G in the right half-plane every stable loop has T = 1. From e to y it passes no
-    less than d whole periods of delay and one of the hold, so T z^(d+1) is analytic outside the
-    unit circle, and by the maximum principle
-
-        ‖T‖∞ >= e^(p T (d + 1)),   ‖S‖∞ >= ‖T‖∞ - 1.
-    """
-    steps = int(run.delay / run.period * (1.0 + 1e-9)) + 1
-    least = np.exp(min(HZ * growth_hz * run.period * steps, 700.0)) - 1.0
-    if least <= S_max:
-        return []
-    return [
-        f"loop: the plant grows as exp(2π {growth_hz:.4g} t) and the force comes {steps} periods "
-        f"of {1e6 * run.period:.4g} us late, so that no controller has a peak of S below "
-        f"{least:.3g}; S_max is {S_max:g}: raise rate_hz, lower delay_us, or hold the plant"
-    ]
-
-
-def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[CaseFinding]:
-    """Warnings of a θ in a unit of mass or stiffness that stands in the matrix in that unit.
-
-    The entries' slopes tell: of a mass in g that is told in kg they are 0.001.
-    """
-    found = []
-    for key, units, slopes in (
-        ("mass", MASS, system.derivatives[0]),
-        ("stiffness", STIFFNESS, system.derivatives[2]),
-    ):
-        for name, unit, slope in zip(problem.names, problem.units, slopes, strict=True):
-            entries = np.abs(slope[np.abs(slope) > 1e-6 * np.abs(slope).max(initial=0.0)])
-            if unit not in units or not entries.size:
-                continue
-            powers = np.log10(entries / units[unit]) / 3.0
-            times = round(float(powers[0]))
-            if times == 0 or not np.allclose(powers, times, atol=1e-4):
-                continue
-            words = (
-                f"theta.{name} is in {unit}, and {key} grows by {entries[0]:.4g} with each, where "
-                f"{units[unit]:g} is meant: is the matrix in another unit? {SI}"
-            )
-            found.append(CaseFinding(Severity.WARNING, Topic.UNITS, words))
-    return found
 
 
 def _searched(problem: CoDesignProblem) -> tuple[float, float]:
@@ -416,4 +225,154 @@ def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> l
     return [
         f"inner.S_max = {S_max:g} is a factor: was {S_max:g} dB meant? Then write {factor:.4g}; "
         "loops on hardware have 1.4 to 2"
+    ]
+
+
+@dataclass(frozen=True)
+class MoveScale:
+    """What moves of machines stay below, in the unit of y and s.
+
+    Attributes
+    ----------
+    stroke, velocity, acceleration : float
+        Of a move.
+    """
+
+    stroke: float
+    velocity: float
+    acceleration: float
+
+
+@dataclass(frozen=True)
+class PlausibilityOptions:
+    """Limits beyond which a question is written.
+
+    Attributes
+    ----------
+    linear : MoveScale
+        m, m/s and m/s²: a long gantry, a fast linear motor, 100 times gravity.
+    rotary : MoveScale
+        rad, rad/s and rad/s²: 16 turns, 10,000 turns a minute, a galvanometer scanner.
+    longest : float
+        Of a move, s.
+    lightest, heaviest : float
+        Moving mass of a motor, over what it moves besides.
+    suits : float
+        Largest ω_b over the frequency at which M_K |G| = 1.
+    steepest : float
+        Power of the frequency with which |S| falls below ω_b: a free mass and an integrator have 3.
+    """
+
+    linear: MoveScale = MoveScale(5.0, 20.0, 1e3)
+    rotary: MoveScale = MoveScale(100.0, 1e3, 1e6)
+    longest: float = 60.0
+    lightest: float = 3e-3
+    heaviest: float = 10.0
+    suits: float = 1.1
+    steepest: float = 3.0
+
+
+def plausibility_findings(
+    problem: CoDesignProblem,
+    facts: PlantFacts,
+    *,
+    options: PlausibilityOptions = PlausibilityOptions(),
+) -> list[CaseFinding]:
+    """Ask about a motor, a move and S_low of a problem that hardly any machine has.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    facts : PlantFacts
+        At the start.
+    options : PlausibilityOptions
+
+    Returns
+    -------
+    list of CaseFinding
+        Warnings.
+    """
+    words = _low_words(problem, facts, options)
+    if (motion := problem.source.motion) is not None:
+        words += [*_motor_words(problem, motion, facts, options)]
+        words += [*_move_words(problem, motion, options)]
+    return [CaseFinding(Severity.WARNING, Topic.UNITS, item) for item in words]
+
+
+def _motor_words(
+    problem: CoDesignProblem, motion: Motion, facts: PlantFacts, options: PlausibilityOptions
+) -> list[str]:
+    """The motor's own mass, beside what it moves."""
+    motor = motion.motor
+    if motor is None or not np.isfinite(facts.inertia) or not is_force(problem.spoken[1]):
+        return []
+    known = {**problem.source.held, **dict(zip(problem.names, problem.start, strict=True))}
+    mass = float(known.get(motor.size, motor.moving_mass[0]))
+    rest = max(facts.inertia - mass, 1e-12 * facts.inertia)
+    if mass == 0.0 or options.lightest <= mass / rest <= options.heaviest:
+        return []
+    key = f"theta.{motor.size}" if motor.size else "motor.moving_mass"
+    times = 1e-3 if mass > rest else 1e3
+    moved, own = (spoken(f"{value:.3g} kg") for value in (rest, mass))
+    size = f"{mass / rest:.2g} times the {moved} that it moves besides"
+    return [f"{key}: {own} is {size}: is it in another unit? In SI it may be {times * mass:.3g}"]
+
+
+def _move_words(
+    problem: CoDesignProblem, motion: Motion, options: PlausibilityOptions
+) -> list[str]:
+    """The move that is named, and the setpoint that is made of it."""
+    limits, words = motion.limits, []
+    most = options.rotary if problem.spoken[0] == "rad" else options.linear
+    made = {"velocity": limits.velocity, "acceleration": limits.acceleration}
+    seconds = 0.0
+    try:
+        profile = motion_of(problem, problem.start).cycle.profile
+        made["acceleration"] = float(np.real(profile.acceleration))
+        seconds = profile.duration
+    except UserError:  # such as of a spring: what makes the move reports it
+        pass
+    for key, value, limit, unit in (
+        ("distance", limits.stroke, most.stroke, "m"),
+        ("velocity", made["velocity"], most.velocity, "m/s"),
+        ("acceleration", made["acceleration"], most.acceleration, "m/s²"),
+    ):
+        if limit < value < np.inf:
+            found = (
+                f"{value:.4g} {unit} is more than the {limit:g} {unit} of most machines: was "
+                f"{value:.4g} m{unit} meant? Then write {1e-3 * value:.4g}"
+            )
+            words.append(f"move.{key}: {spoken(found)}")
+    if seconds > options.longest:
+        words.append(f"[move] takes {seconds:.3g} s: is a limit of it in another unit?")
+    if motion.window >= limits.stroke:
+        words.append(
+            f"move.settle_band = {motion.window:g} is not less than move.distance = "
+            f"{limits.stroke:g}, so that nothing has to move: is one in another unit?"
+        )
+    return words
+
+
+def _low_words(
+    problem: CoDesignProblem, facts: PlantFacts, options: PlausibilityOptions
+) -> list[str]:
+    """The bandwidth that S_low needs at omega_low, against what limits one."""
+    inner, findings = problem.inner, FindingOptions()
+    low = inner.omega_low / HZ
+    least = low * max(2.0**-0.5 / inner.S_low, 1.0) ** (1.0 / options.steepest)
+    shown = (
+        mode.frequency_hz for mode in facts.modes
+        if mode.resonant and min(mode.driven, mode.measured) > findings.shown
+    )  # fmt: skip
+    first, effort = min(shown, default=np.inf), np.nan
+    if states_effort(problem):
+        effort = options.suits * facts.effort_hz
+    limits = [(first, "the first resonance is at")]
+    limits += [(effort, "M_K suits a bandwidth of at most")] if np.isfinite(effort) else []
+    hz, what = min(limits)
+    if inner.S_low >= 2.0**-0.5 or not least > hz:
+        return []
+    return [
+        f"inner.omega_low_hz = {low:g}: |S| <= {inner.S_low:g} there needs a bandwidth of "
+        f"{least:.3g} Hz or more, and {what} {hz:.3g} Hz: was a lower frequency meant?"
     ]

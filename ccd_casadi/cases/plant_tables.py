@@ -4,12 +4,13 @@ import inspect
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import Fail, KeyCheck, short_repr
-from ccd_casadi.cases.tables import Parameter, PlantTable
+from ccd_casadi.cases.tables import Case, Parameter, PlantTable
 from ccd_casadi.plants.registry import model_named, model_names
 from ccd_casadi.support import extensions
 
@@ -183,3 +184,55 @@ def _parameter(name: str, entry: Any, fail: Fail, *, most_values: int = 100) -> 
     if len(values) > most_values:
         raise fail(f"{place}.values", f"has more than {most_values}; give lower and upper instead")
     return Parameter(name, lower, upper, start, unit, values, entry.get("varies", False))
+
+
+def parse_theta(case: Case, text: str) -> tuple[float, ...]:
+    """Read θ from a text.
+
+    Parameters
+    ----------
+    case : Case
+    text : str
+        `m1=60,m2=60`.
+
+    Returns
+    -------
+    tuple of float (n,)
+        In the order of the case.
+
+    Raises
+    ------
+    CaseError
+        A name or a value is wrong or missing.
+    """
+
+    fail = partial(Fail(case.path), "--theta")
+    names = [parameter.name for parameter in case.theta]
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, value = (item.strip() for item in part.partition("="))
+        if not equals:
+            raise fail(
+                f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
+            )
+        if held := next((p for p in case.fixed if p.name == name), None):
+            how = "varies: every design holds at all of its values" if held.varies else "is fixed"
+            raise fail(f"{name} {how}; leave it out, and give {'=..,'.join(names)}=..")
+        if name not in names:
+            raise fail(
+                f"{short_repr(name)} is not a parameter of the case{checks.closest(name, names)}"
+            )
+        if name in found:
+            raise fail(f"{name} is given twice; give it once")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise fail(f"{name} = {short_repr(value)} is not a number; give one") from None
+    for parameter in case.theta:
+        if parameter.name not in found:
+            raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
+        number = found[parameter.name]
+        if not parameter.lower <= number <= parameter.upper:
+            bounds = f"{parameter.lower:g} to {parameter.upper:g}"
+            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
+    return tuple(found[name] for name in names)

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.analysis.sampled_figures import loop_figures
-from ccd_casadi.cases.case import load_case, parse_theta
+from ccd_casadi.analysis.loop_channels import loop_figures
+from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.cases.run_files import (
     controller_of,
     damaged,

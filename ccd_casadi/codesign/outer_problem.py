@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.sweep import SweepOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
+from ccd_casadi.support.errors import interrupts_kept, raise_dropped
 from surrogates import design
 
 IPOPT: dict[str, Any] = {

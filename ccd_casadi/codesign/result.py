@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict

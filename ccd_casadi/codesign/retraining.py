@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.run_folder import read_json
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, RunTerms, outputs_of
 from ccd_casadi.codesign.formulations import Direct, formulation_of

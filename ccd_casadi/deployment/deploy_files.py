@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.sampled_figures import SampledFigures
+from ccd_casadi.analysis.loop_channels import SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.sampled_figures import loop_figures
+from ccd_casadi.analysis.loop_channels import loop_figures
 from ccd_casadi.budget.sources import polynomial
 from ccd_casadi.cases.case import read_toml
 from ccd_casadi.cases.checks import POSITIVE, Fail, require_good, tables

@@ -6,17 +6,14 @@ from functools import partial
 from math import isfinite
 from typing import Any
 
-from ccd_casadi.analysis.loop_channels import LoopChannel
-from ccd_casadi.analysis.sampled_figures import SampledFigures
+from ccd_casadi.analysis.loop_channels import LoopChannel, SampledFigures
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.verdict import Check, State, VerdictOptions, between_finding
-from ccd_casadi.deployment.discretise import Conversion, Target
-from ccd_casadi.deployment.integer_loop import RoundingBound
-from ccd_casadi.deployment.integer_words import rounding_finding
+from ccd_casadi.deployment.discretise import Conversion, LoopLimits, ReducedController, Target
+from ccd_casadi.deployment.integer_loop import RoundingBound, rounding_finding
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.structure import Structure

@@ -10,20 +10,25 @@ import numpy as np
 from ccd_casadi.analysis.loop_channels import (
     LoopChannel,
     along_directions,
+    loop_figures,
     scalar_channels,
     whole_loop,
 )
-from ccd_casadi.analysis.sampled_figures import loop_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.discretise import (
     Conversion,
+    LoopLimits,
+    ReducedController,
+    Reduction,
     Target,
     choose,
     discretise,
     loop_at,
     loops_meet,
+    reductions,
+    smallest,
 )
 from ccd_casadi.deployment.fixed_point import FixedRequest, in_fixed
 from ccd_casadi.deployment.integer_loop import ranges_of_moves, rounding_bound
@@ -35,13 +40,6 @@ from ccd_casadi.deployment.realisation import (
     in_single,
     realise,
     with_anti_windup,
-)
-from ccd_casadi.deployment.reduction import (
-    LoopLimits,
-    ReducedController,
-    Reduction,
-    reductions,
-    smallest,
 )
 from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
 from ccd_casadi.fixed_structure.bounds import Bounds

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_channels import LoopChannel, along_directions
-from ccd_casadi.analysis.sampled_figures import SampledFigures
+from ccd_casadi.analysis.loop_channels import LoopChannel, SampledFigures, along_directions
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.final_judgement import RobustCheckOptions, written_plants
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

@@ -24,8 +24,8 @@ from ccd_casadi.drawing.paint import CSS, block_html, typeset
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.reporting.brief_risks import percent_words, risks, what_if
-from ccd_casadi.reporting.decision import Build, Decision, decide, lines_of
+from ccd_casadi.reporting.concerns import lines_of, percent_words, risks, what_if
+from ccd_casadi.reporting.decision import Build, Decision, decide
 from ccd_casadi.reporting.facts import (
     binding,
     cost_words,
@@ -35,9 +35,9 @@ from ccd_casadi.reporting.facts import (
     theta_words,
 )
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
+from ccd_casadi.reporting.limit_figures import binding_words
 from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
 from surrogates.files import write_whole
 

@@ -1,14 +1,21 @@
-"""What speaks against a loop that meets the bounds of its case: usual limits, the move at its force
-limit, the motor's current, and what must be known of the resonances."""
+"""What speaks against a design: the lines of its verdict, concerns, and what may go wrong.
 
-from collections.abc import Mapping
+A loop may meet the bounds of its case and still exceed usual limits, lack the force for its move,
+or the current of its motor; what must be known of its resonances; what if the machine is not its
+model.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import LoopFigureOptions
-from ccd_casadi.codesign.verdict import State
-from ccd_casadi.support.text import inwards, spoken, with_unit
+from ccd_casadi.codesign.verdict import OwnSet, State, clauses_of
+from ccd_casadi.drawing.content import VerdictRow
+from ccd_casadi.support.text import inwards, number, spoken, with_unit
+
+LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 
 
 class ConcernKind(StrEnum):
@@ -236,3 +243,156 @@ def current_concern(
     most = move["needed_current"] / share
     words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
     return [Concern(ConcernKind.CURRENT, f"{words}, and peak_current is {most:.4g} A")]
+
+
+def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
+    """Read the lines of the verdict of result.json.
+
+    Parameters
+    ----------
+    result : mapping
+
+    Returns
+    -------
+    tuple of VerdictRow
+        Empty for a run without a design, or older than verdicts.
+    """
+    verdict = result.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return ()
+    found = []
+    for name in LINES:
+        line = verdict.get(name)
+        if isinstance(line, Mapping) and line.get("state") in set(State):
+            words, *details = clauses_of(line)
+            found.append(VerdictRow(name, str(line["state"]), words, tuple(details)))
+    return tuple(found)
+
+
+def worst_state(result: Mapping[str, Any]) -> State:
+    """Find the worst state of a verdict: failed, then warned, then passed.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json; an unknown line counts as none of them.
+
+    Returns
+    -------
+    State
+    """
+    states = {line.state for line in lines_of(result)}
+    return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
+
+
+def unproven(result: Mapping[str, Any]) -> str | None:
+    """Why `survives` is neither passed nor warned; None where it is one of them."""
+    line = next((line for line in lines_of(result) if line.name == "survives"), None)
+    if line is None or line.state != State.UNKNOWN:
+        return None
+    own = result["verdict"]["survives"].get("set")
+    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
+
+
+def percent_words(share: float, digits: int) -> str:
+    """A share in percent, without the sign of a zero."""
+    rounded = round(100.0 * share, digits)
+    return f"{rounded + 0.0:.{digits}f}"
+
+
+def what_if(result: Mapping[str, Any], shift: float, gain: float) -> Iterator[tuple[str, str]]:
+    """What becomes of the loop where the machine differs from its model.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    shift, gain : float
+        Of all resonances, and of the whole plant, relative.
+
+    Yields
+    ------
+    (str, str)
+        If, then.
+    """
+    line = result.get("verdict", {}).get("survives", {})
+    percent = f"{100.0 * shift:g} %"
+    for word, end, sign in (("lower", 0, -1.0), ("higher", 1, 1.0)):
+        stable, kept = line.get("stable_shift"), line.get("S_max_shift")
+        if stable is not None and kept is not None:
+            then = f"unstable: it is stable to {100.0 * stable[end]:+.3g} %"
+            if sign * stable[end] >= shift:
+                kept_to = percent_words(abs(kept[end]), 1)
+                then = "stable, and |S| exceeds S_max"
+                then += f" from {kept_to} % on" if float(kept_to) else " at once"
+            if sign * kept[end] >= shift:
+                then = "stable and within S_max"
+            yield f"all resonances are {percent} {word}", then
+    margin = line.get("gain_margin")
+    if margin is not None:
+        low, high = margin
+        fails = not low <= 1.0 - gain <= 1.0 + gain <= high
+        then = "unstable" if fails else "stable"
+        most = f"; on the model it may be {number(low, 2)} to {number(high, 3)} times as large"
+        yield f"the plant's gain is off by {100.0 * gain:g} %", then + most
+    late, deploy = result.get("delay_margin_us"), result.get("verdict", {}).get("deployable", {})
+    rate = deploy.get("rate_hz")
+    if late is not None and rate:
+        period = 1e6 / rate
+        then = "stable" if late > period else "unstable"
+        yield (
+            "one sample more of delay",
+            f"{then}; the delay margin is {number(late / period, 3)} samples",
+        )
+
+
+def risks(
+    result: Mapping[str, Any], *, identified: float = 0.1, least_shift: float = 0.005
+) -> list[str]:
+    """What may go wrong, the most serious first; what has no check is among them.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    identified, least_shift : float
+        Relative: resonances are known that well; and below which none is known.
+
+    Returns
+    -------
+    list of str
+        Sentences.
+    """
+    found = [
+        f"{line.name} {line.state}: {line.words}" for line in lines_of(result)
+        if line.state == State.FAILED
+    ]  # fmt: skip
+    survives = result.get("verdict", {}).get("survives", {})
+    if unproven(result) is not None:
+        found.append(f"The [robust] set is {unproven(result)}.")
+    elif survives.get("set") == "unproven":
+        found.append("The bounds are kept on all plants that were drawn from the [robust] set, and "
+                     "are not proven on all of it.")  # fmt: skip
+    elif not survives.get("robust_set"):
+        found.append("The case names no [robust] set: the loop is judged on its model alone.")
+    found += [f"{one.words[:1].upper()}{one.words[1:]}." for one in loop_concerns(result)]
+    if (result.get("time_budget") or {}).get("ended"):
+        found.append("The search was ended by its time budget: a better design may exist.")
+    if "deployable" in result.get("verdict", {}):
+        unknown = result["verdict"]["deployable"]["state"] == State.UNKNOWN
+        found += ["Hold and delay of the real-time system are not judged yet."] * unknown
+    shift = survives.get("S_max_shift")
+    if shift is not None and min(abs(end) for end in shift) < identified:
+        ends = f"{percent_words(shift[0], 1)} to +{percent_words(shift[1], 1)} %"
+        at_once = min(abs(end) for end in shift) < least_shift
+        words = f"|S| stays within S_max for resonances {ends} off their model"
+        if at_once:
+            words = "|S| exceeds S_max as soon as a resonance is off its model to one side"
+        found.insert(0 if at_once else len(found), f"{words}: identify them that well.")
+    phase, gain = result.get("phase_margin_deg"), result.get("gain_margin")
+    if phase is not None and gain is not None:
+        margins = f"{number(phase, 3)}° of phase and a gain of {number(gain, 3)}, up or down"
+        found.append(f"The least margins are {margins}; unmodelled dynamics use them up.")
+    found.append("Friction, saturation and noise are in no figure of this page unless [move] or "
+                 "[budget] names them.")  # fmt: skip
+    return found

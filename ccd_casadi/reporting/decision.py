@@ -10,18 +10,18 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions, clauses_of
-from ccd_casadi.drawing.content import VerdictRow
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
 from ccd_casadi.reporting.concerns import (
     Concern,
     ConcernKind,
     limited_move,
     limited_move_remedy,
+    lines_of,
     loop_concerns,
     resonance_condition,
+    unproven,
 )
 
-LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 NEXT = {  # what to do about a line that failed, or about what the decision names
     "certified": "make the run again",
     "optimal": "more starts or box_points in [outer]",
@@ -119,55 +119,6 @@ class Decision:
     def refuses(self) -> bool:
         """Whether the design must not be built, or not yet."""
         return self.build in (Build.NO, Build.NOT_YET, Build.NOT_VERIFIED)
-
-
-def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
-    """Read the lines of the verdict of result.json.
-
-    Parameters
-    ----------
-    result : mapping
-
-    Returns
-    -------
-    tuple of VerdictRow
-        Empty for a run without a design, or older than verdicts.
-    """
-    verdict = result.get("verdict")
-    if not isinstance(verdict, Mapping):
-        return ()
-    found = []
-    for name in LINES:
-        line = verdict.get(name)
-        if isinstance(line, Mapping) and line.get("state") in set(State):
-            words, *details = clauses_of(line)
-            found.append(VerdictRow(name, str(line["state"]), words, tuple(details)))
-    return tuple(found)
-
-
-def worst_state(result: Mapping[str, Any]) -> State:
-    """Find the worst state of a verdict: failed, then warned, then passed.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json; an unknown line counts as none of them.
-
-    Returns
-    -------
-    State
-    """
-    states = {line.state for line in lines_of(result)}
-    return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
-
-
-def unproven(result: Mapping[str, Any]) -> str | None:
-    """Why `survives` is neither passed nor warned; None where it is one of them."""
-    line = next((line for line in lines_of(result) if line.name == "survives"), None)
-    if line is None or line.state != State.UNKNOWN:
-        return None
-    own = result["verdict"]["survives"].get("set")
-    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
 
 
 def decide(result: Mapping[str, Any]) -> Decision:

@@ -27,9 +27,9 @@ from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitivity_panel
+from ccd_casadi.reporting.limit_figures import structured_table
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.run_verdict import head_of
-from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.support.extensions import function
 from ccd_casadi.support.text import HZ, number, spoken, with_unit
 

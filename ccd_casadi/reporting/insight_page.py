@@ -22,10 +22,9 @@ from ccd_casadi.reporting.facts import (
     theta_words,
 )
 from ccd_casadi.reporting.gain_figures import run_view
-from ccd_casadi.reporting.limit_figures import limit_blocks
+from ccd_casadi.reporting.limit_figures import binding_words, limit_blocks
 from ccd_casadi.reporting.machine import machine
 from ccd_casadi.reporting.run_verdict import head_of
-from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.support.text import HZ, display_unit, number, spoken
 
 PERCENT = 0.01

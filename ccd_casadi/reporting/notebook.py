@@ -21,8 +21,8 @@ from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
 from ccd_casadi.reporting.facts import conclusion, facts, theta_axes, theta_table
 from ccd_casadi.reporting.gain_figures import gains, run_view, view_of
+from ccd_casadi.reporting.limit_figures import controller_blocks
 from ccd_casadi.reporting.run_verdict import run_head
-from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.support.text import HZ, number, template
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures

@@ -10,11 +10,12 @@ from difflib import unified_diff
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import write_page
-from ccd_casadi.reporting.decision import advice, lines_of
+from ccd_casadi.reporting.concerns import lines_of
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import cost_words, requirement_words, run_name
 from ccd_casadi.reporting.gain_figures import gain_panels, run_view
 from ccd_casadi.support.text import display_unit, number, spoken

@@ -12,8 +12,8 @@ from urllib.parse import quote
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page
 from ccd_casadi.drawing.paint import page_html, update_pages, write_page
-from ccd_casadi.reporting.concerns import loop_concerns
-from ccd_casadi.reporting.decision import advice, lines_of, unproven, worst_state
+from ccd_casadi.reporting.concerns import lines_of, loop_concerns, unproven, worst_state
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrapped

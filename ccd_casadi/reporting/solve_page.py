@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_channels import scalar_channels
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -39,7 +39,15 @@ from ccd_casadi.reporting.landscape import (
     table_trust,
     trust_figure,
 )
-from ccd_casadi.reporting.limit_figures import budget_chapter, limit_blocks, start_chapter
+from ccd_casadi.reporting.limit_figures import (
+    bandwidths_table,
+    binding_words,
+    budget_chapter,
+    controller_blocks,
+    limit_blocks,
+    limits_blocks,
+    start_chapter,
+)
 from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_blocks_of
 from ccd_casadi.reporting.nyquist import bode
@@ -136,7 +144,6 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     parts = design_parts(problem, own, theta, view, result)
     if "proof" in result:  # of a fixed structure
         from ccd_casadi.codesign.verified_structured import VerifiedStructured
-        from ccd_casadi.reporting.structured_page import bandwidths_table
 
         assert isinstance(verified, VerifiedStructured)
         table = bandwidths_table(verified)
@@ -171,12 +178,8 @@ def design_parts(
         "loop": lambda: _loop(own, theta, view),
     }
     if "proof" in result:
-        from ccd_casadi.reporting.structured_page import controller_blocks
-
         parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
     if "costs" in result:
-        from ccd_casadi.reporting.structured_page import limits_blocks
-
         limits = "What limits the bandwidth"
         parts["limits"] = lambda: [c.Chapter(limits, limits_blocks(problem, result))]
     return parts
@@ -191,8 +194,6 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     if "proof" in result:
-        from ccd_casadi.reporting.structured_page import binding_words
-
         rows, bound = facts("structured", problem, result), binding_words(problem, result)
     else:
         rows, bound = facts("design", problem, result), binding(problem, result)

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import scipy
 
-from ccd_casadi.analysis.sampled_figures import loop_figures
+from ccd_casadi.analysis.loop_channels import loop_figures
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.survival import (

@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.modal import ModalPlant
-from ccd_casadi.robust.demands import Demands
+from ccd_casadi.robust import Demands
 from ccd_casadi.robust.margins import (
     DiskMargin,
     Margins,

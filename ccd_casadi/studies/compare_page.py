@@ -1,26 +1,177 @@
-"""report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
+"""What a comparison says: conclusions, compare.json, and report.html with the paper beside."""
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.kinds import design_view
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.decision import lines_of, worst_state
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.reporting.concerns import lines_of, worst_state
+from ccd_casadi.reporting.decision import decide
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from ccd_casadi.reporting.solve_page import stage_chapters
-from ccd_casadi.studies.comparison import LABELS, Comparison, Method, stable_words
-from ccd_casadi.studies.steepest_descent import baseline_of
-from ccd_casadi.support.text import HZ, number
+from ccd_casadi.studies.comparison import Comparison, Method
+from ccd_casadi.studies.steepest_descent import baseline_of, run_entry
+from ccd_casadi.support.json_files import json_values
+from ccd_casadi.support.text import HZ, counted, number, package_text, versions
+
+PUBLISHED: dict[str, dict[str, Any]] = json.loads(package_text("studies/published.json"))
+
+
+LABELS = {
+    "nested": "nested",
+    "lifted": "lifted",
+    "direct": "direct",
+    "steepest_descent": "steepest descent, K fixed",
+    "steepest_descent_total": "steepest descent, total gradient",
+    "sequential": "sequential, next to the start",
+    "sequential_global": "sequential, globally cheapest",
+}
+
+
+def conclusions(
+    problem: CoDesignProblem, methods: dict[str, dict[str, Any]], *, equal: float = 1e-6
+) -> dict[str, Any]:
+    """Figures and sentences; entries without a feasible design are left out of the ranking.
+
+    Two J are equal where they differ by less than `equal` (relative).
+    """
+    solved = {name: f for name, f in methods.items() if f.get("objective") is not None}
+    if not solved:
+        return {"best": None, "sentences": ["No method found a feasible design."]}
+    ranked = sorted(solved, key=lambda name: solved[name]["objective"])
+    best = solved[ranked[0]]["objective"]
+    near = [n for n in ranked if solved[n]["objective"] <= best + equal * abs(best)]
+    cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
+    answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
+    sentences = [
+        f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
+        f"{cheapest} with {solved[cheapest]['syntheses_to_optimum']} true syntheses to the optimum"
+        f"{_beside(solved[cheapest])}."
+    ]
+    for name in ("steepest_descent", "steepest_descent_total"):
+        if name in solved:
+            found, words = _descent(problem, solved[name], solved[cheapest], name, equal)
+            answer[name] = found
+            sentences += words
+    against = [name for name in ranked if name in ("sequential", "sequential_global")]
+    for i, name in enumerate(against):  # the best of them stands first: it is the answer
+        answer[name], sentence = _sequential_words(solved[name], solved[cheapest], name)
+        sentences.insert(len(sentences) if i else 0, sentence)
+    if said := decision(solved[cheapest]):
+        sentences[0] = f"{said} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
+    return answer | {"sentences": sentences}
+
+
+def decision(figures: dict[str, Any]) -> str:
+    """Whether to build a design: of a baseline, which has no other line, by what it survives."""
+    found = decide(figures)
+    if "certified" not in figures.get("verdict", {}) and found.builds:
+        return "Solve the case before you build this: a baseline has no whole verdict."
+    return found.words
+
+
+def stable_words(figures: dict[str, Any]) -> str:
+    """For resonances how far off a loop is stable, in %; what is not known is a dash."""
+    shift = figures.get("verdict", {}).get("survives", {}).get("stable_shift")
+    return "–" if not shift else f"{100.0 * shift[0]:+.2g} to {100.0 * shift[1]:+.2g} %"
+
+
+def _beside(figures: dict[str, Any]) -> str:
+    """The global check over the box that every formulation ends with, and no descent."""
+    beside = figures["syntheses"] - figures["syntheses_to_optimum"]
+    return f", and {beside} in the global check over the box" if beside else ""
+
+
+def _descent(
+    problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str, equal: float
+) -> tuple[dict[str, Any], list[str]]:
+    """How far a descent ends from the best, and what stopped it."""
+    gap = run["objective"] - best["objective"]
+    ratio = run["syntheses"] / best["syntheses_to_optimum"]
+    ends = zip(run["theta"].values(), best["theta"].values(), *box(problem), strict=True)
+    moved = max(abs(a - b) / (high - low) for a, b, low, high in ends)
+    found = {
+        "objective_gap": gap,
+        "synthesis_ratio": ratio,
+        "distance_to_best": moved,
+        "stop": run["stop"],
+        "last_gradient": run["history"][-1]["gradient"],
+    }
+    above = f"{gap:.3g} above" if gap > 0.0 else "the same" if gap == 0.0 else f"{-gap:.3g} below"
+    many = f"{ratio:.0f} times as many" if ratio >= 1.5 else f"{ratio:.2g} times as many"
+    took = "1 synthesis" if run["syntheses"] == 1 else f"{run['syntheses']} syntheses"
+    many = "as many" if run["syntheses"] == best["syntheses_to_optimum"] else many
+    words = [
+        f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
+        f"{run['objective']:.4f}, {above}, after {took}, "
+        f"{many}; all its runs together took {run['syntheses_of_all_runs']}."
+    ]
+    if gap > equal * abs(best["objective"]):
+        words.append(
+            f"It stopped at {100 * moved:.2g} % of the box from the best design, because "
+            f"{run['stop']}."
+        )
+    return found, words
+
+
+def _sequential_words(
+    run: dict[str, Any], best: dict[str, Any], name: str
+) -> tuple[dict[str, Any], str]:
+    cost = 100.0 * (best["hardware_cost"] / run["hardware_cost"] - 1.0)
+    speed = 100.0 * (best["bandwidth_hz"] / run["bandwidth_hz"] - 1.0)
+    found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
+    words = (
+        f"Against the {LABELS[name].replace(',', ' design,')} (hardware cost "
+        f"{run['hardware_cost']:.5g}, {run['bandwidth_hz']:.2f} Hz) co-design "
+        f"changes the hardware cost by {cost:+.1f} % and the bandwidth by {speed:+.1f} %."
+    )
+    return found, words
+
+
+def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
+    """Make the content of compare.json.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    seed : int
+
+    Returns
+    -------
+    dict
+        Plain JSON values.
+    """
+    problem, methods = comparison.problem, comparison.methods
+    entries = {method.name: method.figures for method in methods}
+    descents = [
+        run_entry(run)
+        | {"objective": run.objective, "syntheses": run.syntheses}
+        | {"theta": run.iterates[-1].theta if run.iterates else None}
+        for run in comparison.descents
+    ]
+    published = PUBLISHED.get(problem.source.model or "", {})
+    return json_values({
+        "case": str(comparison.case.path),
+        "methods": entries,
+        "traces": {method.name: [asdict(entry) for entry in method.trace] for method in methods},
+        "descents": descents,
+        "published": published if baseline_of(problem).swept else {},
+        "conclusions": conclusions(problem, entries),
+        "seconds": comparison.seconds,
+        "seed": seed,
+        "versions": versions(),
+    })  # fmt: skip
 
 
 def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> c.Page:

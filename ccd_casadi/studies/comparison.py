@@ -1,155 +1,189 @@
-"""Every method side by side on one case, what follows from their figures, and what the paper
-publishes."""
+"""Methods side by side on one case; hardware of least cost f(θ) first in the sequential one."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import constraint_sizes, objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.decision import decide
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.studies.sequential_hardware import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.studies.steepest_descent import (
     AnyDesign,
     Descent,
     Gradient,
     baseline_of,
+    run_entry,
     steepest_descent,
 )
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress
-from ccd_casadi.support.text import HZ, counted, package_text, versions
+from ccd_casadi.support.text import HZ, versions
 from ccd_casadi.support.worker_process import one_blas_thread
-from surrogates import latin_hypercube
-
-PUBLISHED: dict[str, dict[str, Any]] = json.loads(package_text("studies/published.json"))
+from surrogates import design, latin_hypercube
 
 
-LABELS = {
-    "nested": "nested",
-    "lifted": "lifted",
-    "direct": "direct",
-    "steepest_descent": "steepest descent, K fixed",
-    "steepest_descent_total": "steepest descent, total gradient",
-    "sequential": "sequential, next to the start",
-    "sequential_global": "sequential, globally cheapest",
-}
+@dataclass(frozen=True)
+class HardwareOptions:
+    """Numbers of the sequential hardware design, on cheap models of a plant of finite elements.
 
-
-def conclusions(
-    problem: CoDesignProblem, methods: dict[str, dict[str, Any]], *, equal: float = 1e-6
-) -> dict[str, Any]:
-    """Figures and sentences; entries without a feasible design are left out of the ranking.
-
-    Two J are equal where they differ by less than `equal` (relative).
+    Attributes
+    ----------
+    rounds : int
+        Solves at most, each on a model through the last solutions.
+    tolerance : float
+        Relative difference of ω_1 between model and plant at which they end, and by which ω_1 may
+        be below its bound.
+    model_points : int
+        The last θ at which the plant is evaluated, through which a model passes.
     """
-    solved = {name: f for name, f in methods.items() if f.get("objective") is not None}
-    if not solved:
-        return {"best": None, "sentences": ["No method found a feasible design."]}
-    ranked = sorted(solved, key=lambda name: solved[name]["objective"])
-    best = solved[ranked[0]]["objective"]
-    near = [n for n in ranked if solved[n]["objective"] <= best + equal * abs(best)]
-    cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
-    answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
-    sentences = [
-        f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
-        f"{cheapest} with {solved[cheapest]['syntheses_to_optimum']} true syntheses to the optimum"
-        f"{_beside(solved[cheapest])}."
-    ]
-    for name in ("steepest_descent", "steepest_descent_total"):
-        if name in solved:
-            found, words = _descent(problem, solved[name], solved[cheapest], name, equal)
-            answer[name] = found
-            sentences += words
-    against = [name for name in ranked if name in ("sequential", "sequential_global")]
-    for i, name in enumerate(against):  # the best of them stands first: it is the answer
-        answer[name], sentence = _sequential_words(solved[name], solved[cheapest], name)
-        sentences.insert(len(sentences) if i else 0, sentence)
-    if said := decision(solved[cheapest]):
-        sentences[0] = f"{said} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
-    return answer | {"sentences": sentences}
+
+    rounds: int = 8
+    tolerance: float = 1e-6
+    model_points: int = 3
 
 
-def decision(figures: dict[str, Any]) -> str:
-    """Whether to build a design: of a baseline, which has no other line, by what it survives."""
-    found = decide(figures)
-    if "certified" not in figures.get("verdict", {}) and found.builds:
-        return "Solve the case before you build this: a baseline has no whole verdict."
-    return found.words
+@dataclass(frozen=True)
+class HardwareDesign:
+    """The hardware θ of least cost by the rule of thumb, its cost f(θ) and ω_1.
+
+    `met`: whether it meets the rule and the constraints; if not, it has the largest ω_1 found.
+    """
+
+    theta: tuple[float, ...]
+    hardware_cost: float
+    first_resonance: float
+    met: bool
 
 
-def stable_words(figures: dict[str, Any]) -> str:
-    """For resonances how far off a loop is stable, in %; what is not known is a dash."""
-    shift = figures.get("verdict", {}).get("survives", {}).get("stable_shift")
-    return "–" if not shift else f"{100.0 * shift[0]:+.2g} to {100.0 * shift[1]:+.2g} %"
+def first_resonance(
+    problem: CoDesignProblem, theta: Array, evaluate: Evaluate | None = None
+) -> tuple[float, Array]:
+    """Compute the first resonance ω_1 and its slope ∂ω_1/∂θ = φᵀ(K' - ω_1² M')φ/(2ω_1).
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    theta : array (n,)
+        SI.
+    evaluate : callable or None
+        A model in place of the plant.
+
+    Returns
+    -------
+    float
+        rad/s, of the first flexible mode; NaN where all modes are rigid.
+    array (n,)
+    """
+    system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
+    modal = modal_plant(system, problem.suspension.free)
+    flexible = np.flatnonzero(~modal.rigid & ~modal.driven_away)
+    if flexible.size == 0:
+        return np.nan, np.full(len(theta), np.nan)
+    i = int(flexible[0])
+    omega = float(modal.natural[i])
+    eigenvalue_slope = modal.dK[:, i, i] - omega**2 * modal.dM[:, i, i]
+    return omega, eigenvalue_slope / (2.0 * omega)
 
 
-def _beside(figures: dict[str, Any]) -> str:
-    """The global check over the box that every formulation ends with, and no descent."""
-    beside = figures["syntheses"] - figures["syntheses_to_optimum"]
-    return f", and {beside} in the global check over the box" if beside else ""
+def design_hardware(
+    problem: CoDesignProblem,
+    resonance: float,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    workers: Pool | None = None,
+    options: HardwareOptions = HardwareOptions(),
+) -> HardwareDesign:
+    """Minimise f(θ) over ω_1(θ) >= resonance, λ(θ) <= 0 and the box of θ, by IPOPT.
+
+    Parameters
+    ----------
+    resonance : float
+        rad/s.
+    starts : int
+        Sobol points from which it is solved besides the case's start. With none it is the local
+        optimum next to that start, which need not be the least one (for the two masses it is the
+        paper's equal-mass design).
+    """
+    points = [problem.start]
+    if starts > 0:
+        points += map(tuple, design("sobol", *box(problem), starts, seed).tolist())
+    tasks = {start: (problem, resonance, start, options) for start in points}
+    ends = [end for _, end in sorted(results(workers, _from_start, tasks))]
+    highest = max(ends, key=lambda end: end.first_resonance)
+    feasible = (end for end in ends if end.met)
+    return min(feasible, key=lambda end: end.hardware_cost, default=highest)
 
 
-def _descent(
-    problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str, equal: float
-) -> tuple[dict[str, Any], list[str]]:
-    """How far a descent ends from the best, and what stopped it."""
-    gap = run["objective"] - best["objective"]
-    ratio = run["syntheses"] / best["syntheses_to_optimum"]
-    ends = zip(run["theta"].values(), best["theta"].values(), *box(problem), strict=True)
-    moved = max(abs(a - b) / (high - low) for a, b, low, high in ends)
-    found = {
-        "objective_gap": gap,
-        "synthesis_ratio": ratio,
-        "distance_to_best": moved,
-        "stop": run["stop"],
-        "last_gradient": run["history"][-1]["gradient"],
-    }
-    above = f"{gap:.3g} above" if gap > 0.0 else "the same" if gap == 0.0 else f"{-gap:.3g} below"
-    many = f"{ratio:.0f} times as many" if ratio >= 1.5 else f"{ratio:.2g} times as many"
-    took = "1 synthesis" if run["syntheses"] == 1 else f"{run['syntheses']} syntheses"
-    many = "as many" if run["syntheses"] == best["syntheses_to_optimum"] else many
-    words = [
-        f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
-        f"{run['objective']:.4f}, {above}, after {took}, "
-        f"{many}; all its runs together took {run['syntheses_of_all_runs']}."
-    ]
-    if gap > equal * abs(best["objective"]):
-        words.append(
-            f"It stopped at {100 * moved:.2g} % of the box from the best design, because "
-            f"{run['stop']}."
-        )
-    return found, words
+def _from_start(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...], options: HardwareOptions
+) -> HardwareDesign:
+    """The local optimum next to a start; of an expensive plant by a sequence of models, each exact
+    at the last solutions."""
+    plant = plant_of(problem)
+    solutions: tuple[tuple[float, ...], ...] = (start,)
+    for _ in range(options.rounds):
+        model = None if plant.nearby is None else plant.nearby(solutions)
+        point, predicted = _least_cost(problem, resonance, solutions[-1], model)
+        omega = predicted if model is None else first_resonance(problem, point)[0]
+        theta = tuple(float(v) for v in point)
+        if abs(predicted / omega - 1.0) <= options.tolerance or np.isnan(omega):
+            break
+        solutions = (*solutions[1 - options.model_points :], theta)
+    met = bool(omega >= resonance * (1.0 - options.tolerance)) and not violated(problem, point)
+    return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
 
 
-def _sequential_words(
-    run: dict[str, Any], best: dict[str, Any], name: str
-) -> tuple[dict[str, Any], str]:
-    cost = 100.0 * (best["hardware_cost"] / run["hardware_cost"] - 1.0)
-    speed = 100.0 * (best["bandwidth_hz"] / run["bandwidth_hz"] - 1.0)
-    found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
-    words = (
-        f"Against the {LABELS[name].replace(',', ' design,')} (hardware cost "
-        f"{run['hardware_cost']:.5g}, {run['bandwidth_hz']:.2f} Hz) co-design "
-        f"changes the hardware cost by {cost:+.1f} % and the bandwidth by {speed:+.1f} %."
+def _least_cost(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...], evaluate: Evaluate | None
+) -> tuple[Array, float]:
+    """Minimise f(θ)/|f(start)| over ln(resonance/ω_1) <= 0 and λ/size <= 0 from a start: θ and ω_1.
+
+    The start where IPOPT fails. `evaluate`: a model in place of the plant.
+    """
+    plant = plant_of(problem)
+    theta = ca.MX.sym("theta", len(start))
+    cost, lam = plant.hardware(theta)
+    resonance_at = lru_cache(maxsize=None)(
+        lambda point: first_resonance(problem, np.array(point), evaluate)
     )
-    return found, words
+    log_ratio = VectorCallback(
+        "first_resonance", len(start), 1,
+        lambda x: np.array([np.log(resonance_at(tuple(x))[0] / resonance)]),
+        lambda x: resonance_at(tuple(x))[1][None] / resonance_at(tuple(x))[0],
+    )  # fmt: skip
+    program = NonlinearProgram(
+        x=theta,
+        f=cost / (abs(hardware_cost(plant, start)) or 1.0),
+        g=ca.vertcat(-log_ratio(theta), lam / ca.DM(constraint_sizes(problem))),
+        box=box(problem),
+        exact_hessian=False,
+    )
+    try:
+        point = solve_program(program, np.array([start])).best.x
+    except OuterFailure:
+        point = np.array(start)
+    return point, resonance_at(tuple(point))[0]
 
 
 @dataclass(frozen=True)
@@ -293,7 +327,7 @@ def _best_descent(
     runs = [descent for descent in descents if descent.gradient is gradient]
     best = min(runs, key=lambda d: (round(d.objective, 9), d.syntheses))
     name = "steepest_descent" if gradient is Gradient.FIXED else "steepest_descent_total"
-    extra = _run_dict(best) | {
+    extra = run_entry(best) | {
         "runs": len(runs),
         "syntheses_of_all_runs": sum(run.syntheses for run in runs),
         "history": [asdict(iterate) for iterate in best.iterates],
@@ -311,17 +345,6 @@ def _best_descent(
     )
     path = tuple(item.theta for item in best.iterates)
     return Method(name, json_values(figures), path, trace, controller=made)
-
-
-def _run_dict(descent: Descent) -> dict[str, Any]:
-    """How a descent began, and how it ended."""
-    return {
-        "gradient": descent.gradient.value,
-        "start": descent.start,
-        "first_step": descent.first_step,
-        "stop": descent.stop.value,
-        "iterations": len(descent.iterates),
-    }
 
 
 def _sequential(given: _Setting, name: str, starts: int) -> Method:
@@ -375,38 +398,3 @@ def _figures(
 
 def _resonance(problem: CoDesignProblem, theta: tuple[float, ...]) -> float:
     return first_resonance(problem, np.array(theta))[0] / HZ
-
-
-def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
-    """Make the content of compare.json.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    seed : int
-
-    Returns
-    -------
-    dict
-        Plain JSON values.
-    """
-    problem, methods = comparison.problem, comparison.methods
-    entries = {method.name: method.figures for method in methods}
-    descents = [
-        _run_dict(run)
-        | {"objective": run.objective, "syntheses": run.syntheses}
-        | {"theta": run.iterates[-1].theta if run.iterates else None}
-        for run in comparison.descents
-    ]
-    published = PUBLISHED.get(problem.source.model or "", {})
-    return json_values({
-        "case": str(comparison.case.path),
-        "methods": entries,
-        "traces": {method.name: [asdict(entry) for entry in method.trace] for method in methods},
-        "descents": descents,
-        "published": published if baseline_of(problem).swept else {},
-        "conclusions": conclusions(problem, entries),
-        "seconds": comparison.seconds,
-        "seed": seed,
-        "versions": versions(),
-    })  # fmt: skip

@@ -332,3 +332,14 @@ def steepest_descent(
     design = None if answer is None else answer.design
     seconds = perf_counter() - began
     return Descent(gradient, tuple(start), first_step, tuple(history), design, stop, spent, seconds)
+
+
+def run_entry(descent: Descent) -> dict[str, Any]:
+    """How a descent began, and how it ended."""
+    return {
+        "gradient": descent.gradient.value,
+        "start": descent.start,
+        "first_step": descent.first_step,
+        "stop": descent.stop.value,
+        "iterations": len(descent.iterates),
+    }

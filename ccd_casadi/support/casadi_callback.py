@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.interrupts import ctrl_c_pending
+from ccd_casadi.support.errors import ctrl_c_pending
 
 Map = Callable[[Array], Array]
 

@@ -19,8 +19,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, NoReturn
 
-from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
+from ccd_casadi.support.errors import (
+    PlantError,
+    UserError,
+    ctrl_c_noticed,
+    raise_on_ctrl_c,
+    was_ctrl_c,
+)
 from ccd_casadi.support.options import (
     DEFAULT_CASE,
     ExitCode,

@@ -13,8 +13,7 @@ from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar, cast
 
 from ccd_casadi.support import extensions
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.interrupts import raise_dropped
+from ccd_casadi.support.errors import UserError, raise_dropped
 from ccd_casadi.support.time_budget import InTime
 from ccd_casadi.support.worker_process import (
     R,

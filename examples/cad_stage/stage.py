@@ -8,7 +8,7 @@ from pathlib import Path
 
 import build123d as cad
 
-from ccd_casadi.extensions.cad.morph import draw_morph
+from ccd_casadi.extensions.cad.cad_stage import draw_morph
 
 HUB, BORE, ROOT = 50.0, 24.0, 74.0  # mm: radii, and an arm's width at the hub's centre
 ARMS = {"left": (150.0, 130.0), "right": (30.0, 130.0), "front": (270.0, 104.0)}  # degrees, mm

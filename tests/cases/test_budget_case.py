@@ -10,9 +10,8 @@ from oracles.case_documents import TWO_MASS
 
 from ccd_casadi.budget.error_density import integrate
 from ccd_casadi.budget.sources import ShapedSpectrum, SourceKind, TabulatedSpectrum
-from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.result_entries import budget_entry
 from ccd_casadi.drawing.paint import block_html

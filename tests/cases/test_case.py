@@ -13,9 +13,9 @@ import pytest
 from oracles.case_documents import DROP, PLANT, TWO_MASS, edited, message
 
 from ccd_casadi.cases import DRAWING, SAMPLING, is_searched, plant_tables
-from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants import registry

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from oracles.case_documents import DOCUMENT, PLANT, TWO_MASS, again, edited, message, verdict
 from oracles.helpers import few
 
-from ccd_casadi.cases.case import load_case, parse_case
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml, load_case, parse_case
 from ccd_casadi.cases.tables import Case
 
 

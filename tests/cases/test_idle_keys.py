@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.case import CaseError, parse_case
+from ccd_casadi.cases.case import CaseError, case_to_toml, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of
 from ccd_casadi.support.text import package_text
 

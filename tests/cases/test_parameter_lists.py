@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.compare import main as compare
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"

@@ -10,9 +10,8 @@ import pytest
 import ccd_casadi as ccd
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.diagnosis import diagnose, suspicions
+from ccd_casadi.cases.diagnosis import diagnose, plant_report, suspicions
 from ccd_casadi.cases.findings import Severity, Topic
-from ccd_casadi.cases.plant_report import plant_report
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.check import main as check
 from ccd_casadi.inner import main as inner

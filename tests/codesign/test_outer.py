@@ -22,7 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.optim.pieces import Box
-from ccd_casadi.studies.sequential_hardware import design_hardware, first_resonance
+from ccd_casadi.studies.comparison import design_hardware, first_resonance
 
 W1, W2 = 0.0995, -0.9950
 LOWER, UPPER = np.array([55.0, 55.0]), np.array([70.0, 70.0])

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.codesign.final_judgement import OtherDamping, survived
 from ccd_casadi.codesign.survival import (
     PEAK,

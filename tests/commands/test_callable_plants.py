@@ -13,7 +13,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import ccd_casadi as ccd
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.user_code import GivenFunction
 from ccd_casadi.support.worker_process import one_blas_thread

@@ -17,13 +17,12 @@ from typing import Any
 import jsonschema
 import pytest
 
+from ccd_casadi import robust
 from ccd_casadi.__main__ import ALIASES, OWN, commands, main, overview
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import CaseError, case_schema, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.robust import demands
 from ccd_casadi.support import extensions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +51,7 @@ def options_read(module: ModuleType) -> set[str]:
     shared = ROOT / "ccd_casadi" / "support" / "command_line.py"
     found = set(re.findall(r"\boptions\.(\w+)", text + shared.read_text()))
     if "move_limits(options)" in text:
-        found |= {name for name, _, _ in demands._MOVE}
+        found |= {name for name, _, _ in robust._MOVE}
     if "break_frequencies(options)" in text:
         found |= {"omega_S_hz", "omega_T_hz"}
     return found

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.support.interrupts import ctrl_c_noticed, interrupts_kept, raise_dropped, was_ctrl_c
+from ccd_casadi.support.errors import ctrl_c_noticed, interrupts_kept, raise_dropped, was_ctrl_c
 
 ROOT = Path(__file__).parents[2]
 # Imported by every command after our own package, and long before `main`.

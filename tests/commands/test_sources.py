@@ -14,7 +14,7 @@ LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/extensions/cluster/d
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {
-    ("ccd_casadi/extensions/formats/fmu.py", "subprocess.run"),
+    ("ccd_casadi/extensions/formats/code_formats.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
     ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page

@@ -29,9 +29,9 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment import Timing, pipeline
+from ccd_casadi.deployment.discretise import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.realisation import assemble
-from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ

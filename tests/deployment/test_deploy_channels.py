@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from oracles.case_documents import TWO_MASS
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun

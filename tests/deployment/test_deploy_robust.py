@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment import Timing

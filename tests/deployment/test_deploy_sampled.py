@@ -10,7 +10,7 @@ from oracles.helpers import few
 from oracles.sampled_simulation import measure_set, simulate
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.sampled_figures import SampledFigures, sampled_figures, worst_figures
+from ccd_casadi.analysis.loop_channels import SampledFigures, sampled_figures, worst_figures
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop

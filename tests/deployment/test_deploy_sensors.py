@@ -23,13 +23,13 @@ from ccd_casadi.deployment.on_hardware import forward_of, move, on_hardware
 from ccd_casadi.deployment.outcome import Deployment, deployed_line
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.source_code import COMPILE, write_c
-from ccd_casadi.extensions.formats.structured_text import structured_text
+from ccd_casadi.extensions.formats.code_formats import structured_text
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.ports import course
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.robust.demands import Demands
+from ccd_casadi.robust import Demands
 from ccd_casadi.robust.perturbed import judge
 from ccd_casadi.robust.study import robustness
 from ccd_casadi.support.errors import UserError

@@ -12,7 +12,7 @@ from test_deploy_code import of_one_channel, random_controller
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, with_anti_windup
 from ccd_casadi.deployment.source_code import c_files
-from ccd_casadi.extensions.formats.fmu import FLAGS, compiled, write_fmu
+from ccd_casadi.extensions.formats.code_formats import FLAGS, compiled, write_fmu
 from ccd_casadi.support.errors import UserError
 
 fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")

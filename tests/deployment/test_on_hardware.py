@@ -36,7 +36,7 @@ from ccd_casadi.deployment.realisation import (
     with_anti_windup,
 )
 from ccd_casadi.deployment.source_code import vectors
-from ccd_casadi.extensions.formats.structured_text import structured_text
+from ccd_casadi.extensions.formats.code_formats import structured_text
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant

@@ -9,8 +9,7 @@ from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.deployment.realisation import with_anti_windup
 from ccd_casadi.deployment.source_code import vectors
-from ccd_casadi.extensions.formats.plcopen import SPACE, XHTML, plcopen_xml
-from ccd_casadi.extensions.formats.structured_text import structured_text
+from ccd_casadi.extensions.formats.code_formats import SPACE, XHTML, plcopen_xml, structured_text
 
 N = {"p": SPACE, "h": XHTML}
 WORDS = {"inputVars": "VAR_INPUT", "outputVars": "VAR_OUTPUT", "localVars": "VAR"}

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
+from ccd_casadi.deploy import needed_words, shortfall_words
 from ccd_casadi.deployment.discretise import Conversion
-from ccd_casadi.deployment.timing_words import needed_words, shortfall_words
 from ccd_casadi.lti.loop import Sampling
 
 RATES = st.sampled_from([500.0, 1000.0, 4000.0, 8000.0, 10000.0])

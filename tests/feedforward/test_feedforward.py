@@ -23,14 +23,16 @@ from ccd_casadi.extensions.feedforward.feedforward_files import (
     read_error,
     write_code,
 )
-from ccd_casadi.extensions.feedforward.learning import (
+from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTimeOptions, least_time
+from ccd_casadi.extensions.feedforward.move_responses import (
+    MoveResponses,
+    Shape,
     contraction,
     learned,
     learning_gain,
     least_error,
+    responses_of,
 )
-from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTimeOptions, least_time
-from ccd_casadi.extensions.feedforward.move_responses import MoveResponses, Shape, responses_of
 from ccd_casadi.extensions.feedforward.set_feedforward import FeedforwardSetOptions, _shapes
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace

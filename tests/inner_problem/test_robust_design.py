@@ -15,10 +15,9 @@ from oracles.helpers import (
     two_mass_model,
 )
 
-from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case import case_to_toml, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
 from ccd_casadi.plants.modal import Perturbation, modal_plant

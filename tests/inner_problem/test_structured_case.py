@@ -9,9 +9,8 @@ import pytest
 from oracles.case_documents import TWO_MASS
 from oracles.helpers import random_plant
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

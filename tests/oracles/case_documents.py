@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case, parse_case
 from ccd_casadi.cases.tables import Case
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"

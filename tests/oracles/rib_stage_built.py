@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
 from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

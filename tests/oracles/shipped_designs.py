@@ -23,8 +23,9 @@ import numpy as np
 
 from ccd_casadi import inner
 from ccd_casadi.analysis.loop_warnings import light_roots
-from ccd_casadi.cases.case import load_case, parse_theta
+from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace

@@ -10,7 +10,7 @@ from pathlib import Path
 from ccd_casadi import report
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.reporting.brief import BriefOptions, bars, before_and_after, brief_html, nearest
-from ccd_casadi.reporting.brief_risks import risks, what_if
+from ccd_casadi.reporting.concerns import risks, what_if
 
 OPTIONS = BriefOptions()
 SURVIVES = {

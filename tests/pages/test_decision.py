@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.reporting.brief_risks import risks
-from ccd_casadi.reporting.concerns import ConcernKind, ConditionOptions, resonance_condition
+from ccd_casadi.reporting.concerns import ConcernKind, ConditionOptions, resonance_condition, risks
 from ccd_casadi.reporting.decision import NEXT, Build, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")

@@ -23,10 +23,9 @@ from ccd_casadi.extensions.explorer.curves import (
     with_sampled,
 )
 from ccd_casadi.extensions.explorer.designs import How, Standing, elements_at, judged, present
-from ccd_casadi.extensions.explorer.knobs import Problems, case_at, knobs_of
+from ccd_casadi.extensions.explorer.knobs import Notch, Problems, case_at, knobs_of, notched
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
-from ccd_casadi.extensions.explorer.landscape_map import landscape_of, steepest_axes
-from ccd_casadi.extensions.explorer.notch import Notch, notched
+from ccd_casadi.extensions.explorer.pins import landscape_of, steepest_axes
 from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop

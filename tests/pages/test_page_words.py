@@ -24,7 +24,8 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.reporting.decision import LINES, advice
+from ccd_casadi.reporting.concerns import LINES
+from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import facts, theta_table, theta_words
 from ccd_casadi.reporting.gain_figures import above
 from ccd_casadi.reporting.insight_page import front_answer
@@ -33,7 +34,7 @@ from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
 from ccd_casadi.reporting.nyquist import drawable, nyquist_panel
 from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.run_verdict import head_of, run_head
-from ccd_casadi.studies.comparison import conclusions
+from ccd_casadi.studies.compare_page import conclusions
 from ccd_casadi.support.text import HZ
 
 

@@ -7,9 +7,8 @@ import numpy as np
 
 import ccd_casadi as ccd
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.plant_report import plant_report
-from ccd_casadi.cases.schema import case_to_toml
+from ccd_casadi.cases.case import case_to_toml
+from ccd_casadi.cases.diagnosis import diagnose, plant_report
 from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
 from ccd_casadi.reporting.facts import facts
 from ccd_casadi.reporting.moves import way_words

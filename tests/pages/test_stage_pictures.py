@@ -25,8 +25,7 @@ from ccd_casadi.drawing.surface import (
     still,
 )
 from ccd_casadi.drawing.svg import ModeShape, ModeShapes
-from ccd_casadi.extensions.rib_stage.geometry import UPPER, Geometry, PointMass, bays, mass
-from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.geometry import COARSE, UPPER, Geometry, PointMass, bays, mass
 from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.extensions.rib_stage.pictures import drawing, mode_shapes
 from ccd_casadi.reporting.machine import mode_shape_figure, table_modes

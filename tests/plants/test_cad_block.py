@@ -10,7 +10,7 @@ from oracles.block_kernel import CELLS, Block, draw
 from oracles.helpers import few
 
 from ccd_casadi.extensions.cad import solid
-from ccd_casadi.extensions.cad.morph import draw_morph
+from ccd_casadi.extensions.cad.cad_stage import draw_morph
 from ccd_casadi.extensions.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
 from ccd_casadi.support.errors import PlantError
 

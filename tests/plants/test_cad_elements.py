@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from ccd_casadi.drawing.content import Lines
-from ccd_casadi.extensions.cad.cad_stage import CadStage, plant_of_stage
+from ccd_casadi.extensions.cad.cad_stage import (
+    CadStage,
+    Morph,
+    plant_of_stage,
+    read_morph,
+    write_morph,
+)
 from ccd_casadi.extensions.cad.elastic_body import Body, Material, reduced
-from ccd_casadi.extensions.cad.morph import Morph, read_morph, write_morph
 from ccd_casadi.extensions.cad.solid import extended, volumes
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError

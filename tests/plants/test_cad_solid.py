@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.cad.morph import draw_morph
+from ccd_casadi.extensions.cad.cad_stage import draw_morph
 from ccd_casadi.extensions.cad.solid import (
     Boundary,
     Piece,

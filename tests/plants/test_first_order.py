@@ -18,7 +18,7 @@ from oracles.wired_plants import first_order_system, machine
 from scipy.linalg import block_diag
 
 from ccd_casadi import inner
-from ccd_casadi.cases.diagnosis import _driven_away
+from ccd_casadi.cases.plant_findings import driven_away_findings
 from ccd_casadi.fixed_structure.channel_structure import find_decoupling, is_decoupled
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
@@ -360,7 +360,7 @@ def test_a_case_of_first_order_has_the_controller_of_the_same_mechanics(
 
 def test_what_drives_a_motion_away_is_named_as_it_is_given() -> None:
     facts = PlantFacts((0.5,), (PlantMode(0.0, 0.0, False, 1.0, 1.0, 2.0),), (), np.nan)
-    words = [_driven_away(facts, first, "at the start")[0].words for first in (False, True)]
+    words = [driven_away_findings(facts, first, "at the start")[0].words for first in (False, True)]
     assert "stiffness" in words[0]
     assert "stiffness" not in words[1]
 

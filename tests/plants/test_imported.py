@@ -21,10 +21,10 @@ from ccd_casadi.extensions.imported.interpolation import ANY, InterpolatedModes
 from ccd_casadi.extensions.imported.matrices import modes_of, reduced_table
 from ccd_casadi.extensions.imported.modal_table import (
     ModalTable,
+    frames,
     read_modal_table,
     write_modal_table,
 )
-from ccd_casadi.extensions.imported.mode_matching import frames
 from ccd_casadi.extensions.imported.sampled_plant import plant_of_table
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.plant import Mechanics, mechanics

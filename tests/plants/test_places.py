@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 from scipy.linalg import eigh
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import CaseError, case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.nodes import NodeInterpolation

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.extensions.rib_stage import reduced
-from ccd_casadi.extensions.rib_stage.geometry import Geometry, PointMass
-from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.geometry import COARSE, Geometry, PointMass
 from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, faded
 from ccd_casadi.extensions.rib_stage.stage_plant import plant_of_stage
 from ccd_casadi.plants.plant import Mechanics, nearby_model

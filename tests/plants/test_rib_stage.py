@@ -9,23 +9,21 @@ import pytest
 from oracles.helpers import HZ
 
 from ccd_casadi.extensions.rib_stage.geometry import (
+    COARSE,
+    FINE,
     LOWER,
     UPPER,
     Geometry,
-    PointMass,
-    has_square_symmetry,
-    mass_properties,
-    rigid_fields,
-    rigid_values,
-)
-from ccd_casadi.extensions.rib_stage.mesh import (
-    COARSE,
-    FINE,
     Mesh,
     MeshOrder,
+    PointMass,
     build_mesh,
+    has_square_symmetry,
     line_nodes,
+    mass_properties,
     plain,
+    rigid_fields,
+    rigid_values,
 )
 from ccd_casadi.extensions.rib_stage.model import (
     ModeCount,
@@ -35,8 +33,7 @@ from ccd_casadi.extensions.rib_stage.model import (
 )
 from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
 from ccd_casadi.extensions.rib_stage.stage_modes import functionals, groups_of, spectrum
-from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material, StageError
 from ccd_casadi.plants.plant import Mechanics
 
 Array = np.ndarray

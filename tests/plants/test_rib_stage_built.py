@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from oracles import rib_stage_built as built
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_files import sections_kappa

@@ -13,7 +13,7 @@ from ccd_casadi.extensions.rib_stage.geometry import NAMES
 from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
-from ccd_casadi.studies.sequential_hardware import design_hardware, first_resonance
+from ccd_casadi.studies.comparison import design_hardware, first_resonance
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 
 HZ = 2.0 * np.pi

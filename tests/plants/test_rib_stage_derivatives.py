@@ -5,8 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.rib_stage.geometry import NAMES, Geometry, PointMass
-from ccd_casadi.extensions.rib_stage.mesh import COARSE, MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import COARSE, NAMES, Geometry, MeshOrder, PointMass
 from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.plants.modal import Suspension, modal_plant
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.geometry import COARSE
 from ccd_casadi.extensions.rib_stage.model import RibStage, modes_at, orthonormal_directions
-from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.finite_elements import StageError
 from ccd_casadi.support.worker_process import threads_permitted
 
 A = tuple(1e-3 * np.array([1.0, 3.0, 8.0, 8.0, 16.806, 67.5]))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import eigsh
 
-from ccd_casadi.extensions.rib_stage.mesh import plain
+from ccd_casadi.extensions.rib_stage.geometry import plain
 from ccd_casadi.extensions.rib_stage.model import RibStage
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 
 A = 1e-3 * np.array([1.0, 3.0, 8.0, 8.0, 16.806, 67.5])
 B = 1e-3 * np.array([1.0, 3.0, 4.2446, 4.0588, 11.917, 74.974])

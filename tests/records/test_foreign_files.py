@@ -14,7 +14,7 @@ import pytest
 
 from ccd_casadi.extensions.imported.matrix_files import read_matrix
 from ccd_casadi.extensions.imported.result_files import read_modes
-from ccd_casadi.extensions.records.columns import read_columns
+from ccd_casadi.extensions.records.log_files import read_columns
 from ccd_casadi.plants.measured import read_frequency_response
 from ccd_casadi.support.errors import PlantError, UserError
 

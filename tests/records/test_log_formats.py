@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.records.columns import read_columns
+from ccd_casadi.extensions.records.log_files import read_columns
 from ccd_casadi.extensions.records.time_series import SignalNames, read_record
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables

@@ -13,22 +13,24 @@ import pytest
 import scipy
 from oracles.case_documents import QUICK_SECTIONS
 
-from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.case import case_to_toml, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.deployment.robust_set import members
-from ccd_casadi.extensions.tolerances import answers, share_search, widths
-from ccd_casadi.extensions.tolerances.machines import Machine, MachineOptions, Plan, Trial, drawn
-from ccd_casadi.extensions.tolerances.prices import scaled
-from ccd_casadi.extensions.tolerances.share_certificate import (
+from ccd_casadi.extensions.tolerances import answers, prices, share_search
+from ccd_casadi.extensions.tolerances.answers import tolerance_case
+from ccd_casadi.extensions.tolerances.machines import (
+    Machine,
+    MachineOptions,
+    Plan,
     ShareCertificate,
+    Trial,
     certified_share,
+    drawn,
     judged,
 )
+from ccd_casadi.extensions.tolerances.prices import Bought, WidthSearch, promised, scaled
 from ccd_casadi.extensions.tolerances.share_search import NoDesign, ShareOptions, ShareSearch
-from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
-from ccd_casadi.extensions.tolerances.widths import Bought, WidthSearch, promised
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.insight import main as insight_main
@@ -313,11 +315,11 @@ def test_half_widths_end_where_cost_and_gain_balance(monkeypatch: pytest.MonkeyP
         slopes = {name: 2.0 * each for name, each in off.items()}
         return Bought(tried, (), np.zeros(0), 1.0, sum(x * x for x in off.values()), slopes)
 
-    monkeypatch.setattr(widths, "bought", valley)
-    monkeypatch.setattr(widths, "structured_of", lambda _: SimpleNamespace(uncertainty=own))
+    monkeypatch.setattr(prices, "bought", valley)
+    monkeypatch.setattr(prices, "structured_of", lambda _: SimpleNamespace(uncertainty=own))
     costs = {"gain": 1.0, "mode_shift": 1.0}
     sampler: Any = SimpleNamespace(problem=problem)
-    found = widths.buy(sampler, (), np.zeros(0), costs, {"gain": (0.01, 0.1)}, lambda _: None)
+    found = prices.buy(sampler, (), np.zeros(0), costs, {"gain": (0.01, 0.1)}, lambda _: None)
     assert found is not None
     assert found.best.widths["gain"] == pytest.approx(0.03, rel=1e-2)
     assert found.best.widths["mode_shift"] == pytest.approx(0.06, rel=1e-9)  # twice the case's

@@ -217,7 +217,7 @@ import sys
 sys.path[:0] = {[str(HERE), str(HERE.parent)]!r}
 import ccd_casadi.solve  # as the command does: workers import it as they start
 from ccd_casadi.support.command_line import parser, run
-from ccd_casadi.support.interrupts import exit_on_ctrl_c
+from ccd_casadi.support.errors import exit_on_ctrl_c
 from ccd_casadi.support.process_pool import Workers
 from test_parallel import pid_and_sleep
 

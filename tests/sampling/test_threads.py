@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from ccd_casadi.plants.eigenpairs import Pencil, build_pencil
+from ccd_casadi.plants.finite_elements import Pencil, build_pencil
 from ccd_casadi.support.worker_process import OwnThreads, alongside, side_by_side, threads_permitted
 
 PAGE = 4096  # bytes, at least

@@ -17,7 +17,7 @@ from oracles.fixed_structure_loops import (
     response_and_slopes,
 )
 
-from ccd_casadi.analysis.sampled_figures import sampled_figures
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate import certify

@@ -10,7 +10,7 @@ from oracles.draws import few
 from oracles.helpers import HZ
 from scipy.stats import ortho_group
 
-from ccd_casadi.extensions.rib_stage.mesh import COARSE
+from ccd_casadi.extensions.rib_stage.geometry import COARSE
 from ccd_casadi.extensions.rib_stage.model import RibStage
 from ccd_casadi.kernels import certified_design as design
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant

@@ -8,14 +8,14 @@ import numpy as np
 from scipy import sparse
 
 from ccd_casadi.drawing.svg import ModeShape, ModeShapes, outer_faces
-from ccd_casadi.plants.eigenpairs import (
+from ccd_casadi.plants.finite_elements import (
+    Material,
     Pencil,
     build_pencil,
     build_resolvent,
     flexible_modes,
     orthonormal,
 )
-from ccd_casadi.plants.material import Material
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import require
 

@@ -25,7 +25,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Design, write the folder, print the sheet."""
     from dataclasses import replace
 
-    from ccd_casadi.cases.case import load_case, parse_theta, read_toml
+    from ccd_casadi.cases.case import load_case, read_toml
+    from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.drives.arithmetic import program_of
     from ccd_casadi.extensions.drives.drive_case import drive_problem

@@ -7,16 +7,16 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.analysis import LIMITS
+from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
 from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
-from ccd_casadi.analysis.sampled_figures import sampled_figures
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE
 from ccd_casadi.extensions.explorer.designs import ExploredDesign, Standing
-from ccd_casadi.extensions.explorer.notch import Notched
+from ccd_casadi.extensions.explorer.knobs import Notched
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import missed_by

@@ -16,7 +16,13 @@ from bokeh.models.widgets.markups import Div
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.paint import escape
 from ccd_casadi.extensions.explorer import ASSETS
-from ccd_casadi.extensions.explorer.controls import Controls, PlacesFigure, button, moves
+from ccd_casadi.extensions.explorer.controls import (
+    Controls,
+    NotchFigure,
+    PlacesFigure,
+    button,
+    moves,
+)
 from ccd_casadi.extensions.explorer.curves import (
     EMPTY,
     FIGURES,
@@ -34,13 +40,6 @@ from ccd_casadi.extensions.explorer.curves import (
 from ccd_casadi.extensions.explorer.designs import Designed, ExploredDesign, How, anchored, designed
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
-from ccd_casadi.extensions.explorer.landscape_map import (
-    MapFigure,
-    landscape_of,
-    run_surrogate,
-    steepest_axes,
-)
-from ccd_casadi.extensions.explorer.notch_figure import NotchFigure
 from ccd_casadi.extensions.explorer.painter import (
     ON_DARK,
     Message,
@@ -48,7 +47,14 @@ from ccd_casadi.extensions.explorer.painter import (
     cursor,
     legend_html,
 )
-from ccd_casadi.extensions.explorer.pins import Kept, Pins
+from ccd_casadi.extensions.explorer.pins import (
+    Kept,
+    MapFigure,
+    Pins,
+    landscape_of,
+    run_surrogate,
+    steepest_axes,
+)
 from ccd_casadi.extensions.explorer.session import Session, searched_exactly
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array

@@ -8,8 +8,8 @@ from time import perf_counter
 
 import numpy as np
 
+from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.extensions.explorer.curves import surface_modes_html
 from ccd_casadi.extensions.explorer.designs import (

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, one_line, option, valued
@@ -42,8 +42,12 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.analysis.setpoint import setpoint
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-    from ccd_casadi.extensions.feedforward.feedforward_files import entry, summary, write_code
-    from ccd_casadi.extensions.feedforward.feedforward_page import feedforward_page
+    from ccd_casadi.extensions.feedforward.feedforward_files import (
+        entry,
+        feedforward_page,
+        summary,
+        write_code,
+    )
     from ccd_casadi.extensions.feedforward.set_feedforward import (
         FeedforwardSetOptions,
         profile_of,

@@ -16,14 +16,19 @@ from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.robust_set import members
-from ccd_casadi.extensions.feedforward.learning import contraction, learning_gain
 from ccd_casadi.extensions.feedforward.least_time import (
     ForceLimits,
     LeastTime,
     LeastTimeOptions,
     least_time,
 )
-from ccd_casadi.extensions.feedforward.move_responses import MoveResponses, Shape, responses_of
+from ccd_casadi.extensions.feedforward.move_responses import (
+    MoveResponses,
+    Shape,
+    contraction,
+    learning_gain,
+    responses_of,
+)
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
@@ -88,7 +93,7 @@ class SetFeedforward:
     heat, peak : float
         The largest of all plants, those that judge too, N² s and N.
     contraction : float
-        ρ of `learning`, of the design's plants.
+        ρ of `move_responses`, of the design's plants.
     """
 
     found: LeastTime

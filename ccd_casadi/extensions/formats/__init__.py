@@ -5,8 +5,8 @@ from ccd_casadi.support.extensions import Extension
 TEMPLATES = "extensions/formats/templates"
 EXTENSION = Extension(
     functions={
-        "fmu": "ccd_casadi.extensions.formats.fmu:write_fmu",
-        "plcopen_xml": "ccd_casadi.extensions.formats.plcopen:plcopen_xml",
-        "structured_text": "ccd_casadi.extensions.formats.structured_text:structured_text",
+        "fmu": "ccd_casadi.extensions.formats.code_formats:write_fmu",
+        "plcopen_xml": "ccd_casadi.extensions.formats.code_formats:plcopen_xml",
+        "structured_text": "ccd_casadi.extensions.formats.code_formats:structured_text",
     }
 )

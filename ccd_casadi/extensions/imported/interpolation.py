@@ -9,13 +9,15 @@ and Krein.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from math import comb, prod
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ccd_casadi.extensions.imported.modal_table import ModalTable
-from ccd_casadi.extensions.imported.mode_matching import Frame, fit_entries, frames
+from ccd_casadi.extensions.imported.modal_table import Frame, ModalTable, frames
 from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -60,6 +62,93 @@ class LeftOut:
     def response(self) -> float:
         """The largest."""
         return float(self.responses.max())
+
+
+LOST = "the samples cannot be interpolated"
+
+
+@dataclass(frozen=True)
+class EntryFitOptions:
+    """Numbers of the fit of entries: a polynomial and radial functions of Matérn's kind.
+
+    Attributes
+    ----------
+    most_degree, most_terms : int
+        Of the polynomial.
+    singular : float
+        Relative pivot below which terms are not distinguished by the samples, and leverage of
+        the other samples below which a sample alone settles a term.
+    lengths : tuple of float
+        Lengths of the radial functions that are tried, over half the range of each parameter.
+    largest_coefficient : float
+        Of a radial function, over the numbers: beyond, the sum loses digits.
+    """
+
+    most_degree: int = 12
+    most_terms: int = 500
+    singular: float = 1e-9
+    lengths: tuple[float, ...] = (0.5, 1.0, 2.0)
+    largest_coefficient: float = 1e4
+
+
+def fit_entries(
+    theta: Array, Y: Array, *, options: EntryFitOptions = EntryFitOptions()
+) -> tuple[ca.Function, Array]:
+    """θ -> q numbers, of numbers Y (N, q) at samples θ (N, p), and the error (N, q) at each sample,
+    predicted without it. Raises PlantError where the samples are too few, or one is there twice."""
+    lower, width = theta.min(axis=0), np.ptp(theta, axis=0)
+    N, p = theta.shape
+    unit = 2.0 * (theta - lower) / np.where(width > 0.0, width, np.nan) - 1.0
+    if not np.isfinite(unit).all():
+        raise PlantError(f"{LOST}: a parameter does not vary among the samples; add samples")
+    if len(np.unique(unit, axis=0)) < N:
+        raise PlantError("two samples are at the same theta; keep one of them")
+    squares = ((unit[:, None] - unit) ** 2).sum(axis=2)
+    radial = [_matern(squares / length**2, np) for length in options.lengths]
+    left_out, trend = np.full(Y.shape, np.inf), np.zeros((0, Y.shape[1]))
+    spread = np.zeros((len(options.lengths), *Y.shape))
+    powers = np.zeros((0, p))
+    for degree in range(options.most_degree + 1):
+        if not comb(p + degree, degree) < min(N, options.most_terms + 1):
+            break
+        rows = combinations_with_replacement(range(p), degree)
+        powers = np.vstack([powers, [np.bincount(row, minlength=p) for row in map(list, rows)]])
+        trend = np.pad(trend, ((0, len(powers) - len(trend)), (0, 0)))
+        Q, R = np.linalg.qr(np.prod(unit[:, None, :] ** powers, axis=2), mode="complete")
+        (own, rest), R = np.split(Q, [len(powers)], axis=1), R[: len(powers)]
+        pivots = np.abs(np.diag(R))
+        singular = options.singular
+        if pivots.min() < singular * pivots.max() or (rest**2).sum(axis=1).min() < singular:
+            continue
+        for k, phi in enumerate(radial):
+            W = rest @ np.linalg.solve(rest.T @ phi @ rest, rest.T)
+            a = W @ Y
+            errors = a / np.diag(W)[:, None]
+            better = (errors**2).sum(axis=0) < (left_out**2).sum(axis=0)
+            largest = options.largest_coefficient * np.abs(Y).max(axis=0)
+            better &= (k == 0) | (np.abs(a).max(axis=0) <= largest)
+            left_out[:, better], spread[:, :, better] = errors[:, better], 0.0
+            spread[k][:, better] = a[:, better]
+            trend[:, better] = np.linalg.solve(R, own.T @ (Y - phi @ a))[:, better]
+    if not np.isfinite(left_out).all():
+        words = f"{N} samples of {p} parameters do not settle a polynomial; add samples"
+        raise PlantError(f"{LOST}: {words}")
+    x = ca.MX.sym("theta", p)
+    scaled = 2.0 * (x - lower) / width - 1.0
+    terms = [prod((scaled[j] ** int(k) for j, k in enumerate(row) if k), start=ca.MX(1.0))
+             for row in powers]  # fmt: skip
+    y = ca.mtimes(ca.DM(trend.T), ca.vertcat(*terms))
+    away = ca.sum1((ca.repmat(scaled, 1, N) - ca.DM(unit.T)) ** 2).T
+    for length, a in zip(options.lengths, spread, strict=True):
+        if a.any():
+            y += ca.mtimes(ca.DM(a.T), _matern(away / length**2, ca))
+    return ca.Function("entries", [x], [y]), left_out
+
+
+def _matern(squares: Any, module: Any) -> Any:
+    """φ of squared distances over l², by NumPy or CasADi."""
+    x = module.sqrt(7.0 * squares + 1e-16)  # φ has no slope at a sample, but this root would
+    return (1.0 + x + 0.4 * x**2 + x**3 / 15.0) * module.exp(-x)
 
 
 class InterpolatedModes:

@@ -8,10 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.extensions.imported.interpolation import Errors, InterpolatedModes, row_of
+from ccd_casadi.extensions.imported.interpolation import (
+    Errors,
+    InterpolatedModes,
+    fit_entries,
+    row_of,
+)
 from ccd_casadi.extensions.imported.matrices import reduced_table
 from ccd_casadi.extensions.imported.modal_table import ModalTable, read_modal_table
-from ccd_casadi.extensions.imported.mode_matching import fit_entries
 from ccd_casadi.plants.plant import Plant, named_values
 from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.errors import PlantError

@@ -11,6 +11,6 @@ EXTENSION = Extension(
     },
     functions={
         "measured_answer": "ccd_casadi.extensions.measured.measured_answer:measured_answer",
-        "measured_page": "ccd_casadi.extensions.measured.measured_page:measured_page",
+        "measured_page": "ccd_casadi.extensions.measured.measured_answer:measured_page",
     },
 )

@@ -39,9 +39,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.realisation import realised
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.paint import write_page
-    from ccd_casadi.extensions.measured.measured_answer import answer_of
-    from ccd_casadi.extensions.measured.measured_page import measured_page
-    from ccd_casadi.extensions.measured.present_controller import present_loop
+    from ccd_casadi.extensions.measured.measured_answer import answer_of, measured_page
+    from ccd_casadi.extensions.measured.tuned_plants import present_loop
     from ccd_casadi.extensions.measured.tuning import tune
     from ccd_casadi.fixed_structure.structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords

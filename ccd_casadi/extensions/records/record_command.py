@@ -31,7 +31,8 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     valued("--confidence", "X", real(0.5, 0.9999), "of the spread, at each line", 0.95),
     valued("--gain", "X", positive, "factor on the response, where units are not m and N", 1.0),
     option("--rotary", action="store_true", help="the position is in rad, the force in N m"),
-    needs=["ccd_casadi.extensions.records.plant_estimate", "ccd_casadi.extensions.records.picture"],
+    needs=["ccd_casadi.extensions.records.plant_estimate",
+           "ccd_casadi.extensions.records.record_findings"],
     place=RUN | {"metavar": "LOG", "nargs": "+", "help": "records (.csv, .npz, .mat, .tdms, "
                  ".wav) of one loop; channels of WAV are named 1, 2, ..."},
     without_effect=["--workers", "--seed", "--no-user-code"],
@@ -40,9 +41,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Estimate, print a table, write response.npz, response.csv and response.png."""
     import numpy as np
 
-    from ccd_casadi.extensions.records.picture import record_picture
     from ccd_casadi.extensions.records.plant_estimate import EstimateOptions, estimate_plant
-    from ccd_casadi.extensions.records.record_findings import findings
+    from ccd_casadi.extensions.records.record_findings import findings, record_picture
     from ccd_casadi.extensions.records.time_series import SignalNames, read_record
     from ccd_casadi.support.text import use_units
     from surrogates.files import write_whole

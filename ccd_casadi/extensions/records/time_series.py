@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.extensions.records.columns import Columns, read_columns
+from ccd_casadi.extensions.records.log_files import Columns, read_columns
 from ccd_casadi.extensions.records.signal_names import REFERENCES, column_of, factor_of, parted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -1,15 +1,76 @@
 """K(θ) and M(θ) of one symmetry of the square in a fixed sparsity pattern."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+from numpy.polynomial import legendre
 from scipy import sparse
 
-from ccd_casadi.extensions.rib_stage.geometry import Point
-from ccd_casadi.extensions.rib_stage.mesh import PAIRS, Block, Mesh, cube_mass, cube_stiffness
-from ccd_casadi.plants.material import Material
+from ccd_casadi.extensions.rib_stage.geometry import Block, Mesh, Point, line_values
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.support.arrays import Array
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@cache
+def line_matrices(order: int) -> tuple[Array, Array, Array]:
+    """∫NᵀN, ∫N'ᵀN, ∫N'ᵀN' over [0, 1]; the quadrature is exact."""
+    points, weights = legendre.leggauss(order + 1)
+    N, dN = line_values(order, 0.5 * (points + 1.0))
+    w = 0.5 * weights[:, None]
+    return N.T @ (w * N), dN.T @ (w * N), dN.T @ (w * dN)
+
+
+@cache
+def cube_mass(orders: tuple[int, int, int]) -> Array:
+    """∫NᵀN over the unit cube, (n, n), n nodes with x slowest and z fastest."""
+    return _tensor([line_matrices(p)[0] for p in orders])
+
+
+@cache
+def cube_stiffness(
+    orders: tuple[int, int, int], material: Material
+) -> tuple[tuple[int, int, int, Array], ...]:
+    """K_pq of the PAIRS as (pair, i, j, (n, n) in Pa): what component j of nodes does to i.
+
+    K_pq collects C_ikjl ∂_k N_a ∂_l N_b for {k, l} = {p, q}, with
+    C_ikjl = λ δ_ik δ_jl + μ (δ_ij δ_kl + δ_il δ_kj). What is left out is zero.
+    """
+    lame, mu = material.lame
+    lines = [line_matrices(p) for p in orders]
+
+    def moved(k: int, m: int) -> Array:
+        """∫ ∂_k N_a ∂_m N_b."""
+        factors = []
+        for axis, (mass, slope, stiffness) in enumerate(lines):
+            if k == m == axis:
+                factors.append(stiffness)
+            elif axis == k:
+                factors.append(slope)
+            elif axis == m:
+                factors.append(slope.T)
+            else:
+                factors.append(mass)
+        return _tensor(factors)
+
+    found = []
+    for pair, (p, q) in enumerate(PAIRS):
+        one = moved(p, q)
+        if p == q:
+            own = mu * one
+            found += [(pair, i, i, (lame + 2.0 * mu) * one if i == p else own) for i in range(3)]
+        else:
+            across = lame * one + mu * one.T
+            found += [(pair, p, q, across), (pair, q, p, across.T)]
+    return tuple(found)
+
+
+def _tensor(factors: list[Array]) -> Array:
+    """Kronecker product, the first factor slowest."""
+    x, y, z = factors
+    return np.kron(np.kron(x, y), z)
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from ccd_casadi.extensions.rib_stage.assembly import AS, SA
 from ccd_casadi.extensions.rib_stage.geometry import (
     RIGID_NAMES,
     Geometry,
+    MeshOrder,
     Point,
     has_square_symmetry,
     rigid_fields,
     rigid_values,
 )
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder
 from ccd_casadi.extensions.rib_stage.stage_modes import (
     Discretisation,
     Group,
@@ -32,7 +32,7 @@ from ccd_casadi.extensions.rib_stage.stage_modes import (
     heights,
     spectrum,
 )
-from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.finite_elements import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side

@@ -20,12 +20,12 @@ from ccd_casadi.extensions.rib_stage.assembly import mirror_signs, swap_displace
 from ccd_casadi.extensions.rib_stage.geometry import (
     NAMES,
     Geometry,
+    Mesh,
     axis_lengths,
     bays,
     has_square_symmetry,
     mass,
 )
-from ccd_casadi.extensions.rib_stage.mesh import Mesh
 from ccd_casadi.extensions.rib_stage.model import ModeCount, RibStage, discretisation, modes_at
 from ccd_casadi.extensions.rib_stage.stage_modes import sector_of
 from ccd_casadi.support.arrays import Array

@@ -22,8 +22,13 @@ from scipy import sparse
 from scipy.linalg import block_diag, eigh
 
 from ccd_casadi.extensions.rib_stage.assembly import AS, mirror_signs, swap_displacements
-from ccd_casadi.extensions.rib_stage.geometry import LOWER, UPPER, Point, has_square_symmetry
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import (
+    LOWER,
+    UPPER,
+    MeshOrder,
+    Point,
+    has_square_symmetry,
+)
 from ccd_casadi.extensions.rib_stage.model import (
     TWENTY,
     RibStage,
@@ -46,7 +51,7 @@ from ccd_casadi.extensions.rib_stage.stage_modes import (
     sector_of,
     spectrum,
 )
-from ccd_casadi.plants.material import Material
+from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side

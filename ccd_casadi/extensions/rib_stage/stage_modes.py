@@ -28,16 +28,22 @@ from ccd_casadi.extensions.rib_stage.assembly import (
     point_functional,
     swap_displacements,
 )
-from ccd_casadi.extensions.rib_stage.geometry import Geometry, Point, PointMass, has_square_symmetry
-from ccd_casadi.extensions.rib_stage.mesh import MeshOrder, build_mesh
-from ccd_casadi.plants.eigenpairs import (
+from ccd_casadi.extensions.rib_stage.geometry import (
+    Geometry,
+    MeshOrder,
+    Point,
+    PointMass,
+    build_mesh,
+    has_square_symmetry,
+)
+from ccd_casadi.plants.finite_elements import (
+    Material,
     Pencil,
     build_pencil,
     build_resolvent,
     flexible_modes,
     orthonormal,
 )
-from ccd_casadi.plants.material import Material
 from ccd_casadi.support.arrays import Array
 
 

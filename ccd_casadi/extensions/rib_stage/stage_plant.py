@@ -9,8 +9,15 @@ import casadi as ca
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.extensions.rib_stage import reduced
-from ccd_casadi.extensions.rib_stage.geometry import NAMES, Geometry, Point, PointMass
-from ccd_casadi.extensions.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.extensions.rib_stage.geometry import (
+    COARSE,
+    FINE,
+    NAMES,
+    Geometry,
+    MeshOrder,
+    Point,
+    PointMass,
+)
 from ccd_casadi.extensions.rib_stage.model import (
     FORTY_FOUR,
     OUTPUTS,
@@ -21,9 +28,8 @@ from ccd_casadi.extensions.rib_stage.model import (
 )
 from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
 from ccd_casadi.plants.differenced import remembered
-from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.finite_elements import Material, StageError
 from ccd_casadi.plants.fixed_parameters import with_fixed
-from ccd_casadi.plants.material import Material
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 

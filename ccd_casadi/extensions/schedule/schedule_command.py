@@ -24,18 +24,19 @@ from ccd_casadi.support.terminal import inform, remark, say
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Design, judge, simulate the way, write schedule.json, C code and the page."""
-    from ccd_casadi.cases.case import load_case, parse_theta
+    from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.schedule.handover import rates_tried
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
         entry,
         kept_at_positions,
+        schedule_page,
         summary,
         write_code,
     )
-    from ccd_casadi.extensions.schedule.schedule_page import schedule_page
     from ccd_casadi.extensions.schedule.segments import ScheduleOptions, scheduled_name, segments_of
     from ccd_casadi.inner_problem.structured_problem import structured_of
     from ccd_casadi.support.json_files import write_json

@@ -22,15 +22,16 @@ from ccd_casadi.support.terminal import inform, say
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.case import load_case, parse_theta
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import write_case
     from ccd_casadi.extensions.tolerances.answers import (
         design_for_share,
         price_answer,
         share_answer,
+        tolerance_case,
     )
-    from ccd_casadi.extensions.tolerances.tolerance_case import tolerance_case
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.errors import UserError

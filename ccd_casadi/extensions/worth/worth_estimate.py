@@ -32,7 +32,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.studies.sequential_hardware import design_hardware, first_resonance
+from ccd_casadi.studies.comparison import design_hardware, first_resonance
 from ccd_casadi.studies.steepest_descent import baseline_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
