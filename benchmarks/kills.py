@@ -101,10 +101,8 @@ def table(folder: Path) -> list[tuple[Any, ...]]:
 
 def result(folder: Path) -> dict[str, Any]:
     """result.json without what no two runs share."""
-    found: dict[str, Any] = json.loads((folder / "result.json").read_text())
-    for name in ("seconds", "phase_seconds"):
-        found.pop(name)
-    return found
+    found = json.loads((folder / "result.json").read_text())
+    return {name: found[name] for name in found if name not in ("seconds", "phase_seconds")}
 
 
 def sampling(folder: Path, number: int) -> list[str]:
