@@ -5,8 +5,7 @@ undisturbed, compares it with one that never was disturbed, and writes benchmark
 
 Sampling and solving must end with the same result.json (seconds aside), controller.json,
 surrogate.json, and the same rows in the store, to the last bit. Retraining decides from the samples
-that are there, so a batch cut short may lead it along another way: it must end verified at the same
-optimum (1e-6), and how many runs are equal to the last bit is told.
+that are there, which a batch cut short may change: it must end verified at the same J to 1e-6.
 """
 
 import argparse
