@@ -282,8 +282,9 @@ def _with_a_better_optimum(row, K, gp, bound, backoff):
     )
     row[Column.SCHUR_FORMS] += more
     # only what both agree on within their errors is the same optimum; one whose error is not known
-    # has not been found, and gives way to one that is found to within the back-off
-    if not (closed and left < min(error, backoff - 1.0) and abs(again - gamma_opt) <= error * again):
+    # gives way instead to one that is found to within the back-off
+    sure = closed and left < min(error, backoff - 1.0)
+    if not (sure and abs(again - gamma_opt) <= error * again):
         return row, *K
     row[Column.GAMMA_OPT], row[Column.GAMMA_ERROR] = again, left
     row[Column.LIMITED_BY_BOUND] = at_bound

@@ -1,4 +1,4 @@
-"""γ_opt of machines as they are wired: where two directions of X meet, and where rounding decides."""
+"""γ_opt of wired machines where two directions of X meet, and where rounding decides."""
 
 from dataclasses import replace
 
