@@ -290,6 +290,7 @@ def _read_mixed(
         omega_low=problem.inner.omega_low, gamma_opt=number_of(path, result, "gamma_opt"),
         gamma_lower_bound=number_of(path, result, "gamma_lower_bound"),
     )  # fmt: skip
+    figures = replace(figures, gamma_error=made.gamma_error)
     if not figures.certified:
         words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
         raise UserError(f"{folder / 'controller.json'}: {words}; make the run again")

@@ -42,6 +42,7 @@ def figures_dict(figures: DesignFigures) -> dict[str, Any]:
         "reason": figures.outcome.value,
         "bandwidth_hz": figures.bandwidth / HZ,
         "gamma_opt": figures.gamma_opt,
+        "optimum": figures.optimum.value,
         "gamma": figures.gamma,
         "gamma_lower_bound": figures.gamma_lower_bound,
         "sensitivity_peak": figures.sensitivity_peak,

@@ -173,7 +173,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
             step = f / (slope * t * t)  # Newton's, in 1/t
             error = abs(step)
             if error * t < 0.3:
-                better, estimate = root_nearby(B1, C1, d1, frame, step)
+                better, estimate = root_nearby(B1, C1, d1, frame, step, noise)
                 if abs(better - step) < 0.5 * abs(step):
                     step, error = better, estimate
             new = t / (1.0 + step * t) if step * t > -1.0 else np.inf

@@ -127,8 +127,10 @@ def _singularity(U1, U2, Z, q, p):
 
 
 @inlined
-def root_nearby(B1, C1, d1, frame, δ):
+def root_nearby(B1, C1, d1, frame, δ, noise):
     """Where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
+
+    The estimate is infinite where X is negative there in another direction: its root is higher.
 
     In the coordinates of [[U1, -U2], [U2, U1]] the stable subspace at 1/t + δ is [I; Z(δ)] with
 
@@ -169,6 +171,18 @@ def root_nearby(B1, C1, d1, frame, δ):
         δ0, g0, δ = δ, g, δ - g * (δ - δ0) / (g - g0)
         if abs(δ - δ0) <= 1e-8 * abs(δ):  # the step after it would be 1e-8 times as small
             break
+    Z = np.zeros((N, N))
+    add(Z, 0, 0, δ, Z1)
+    add(Z, 0, 0, δ**2, Z2)
+    add(Z, 0, 0, δ**3, Z3)
+    # U1ᵀU2 = U1ᵀX U1 at the root: as many negative eigenvalues as X, one zero
+    if not np.isfinite(Z).all():
+        return δ, np.inf
+    top, low = U1.copy(), U2.copy()
+    add(top, 0, 0, -1.0, U2 @ Z)
+    add(low, 0, 0, 1.0, U1 @ Z)
+    if np.linalg.eigvalsh(symmetric_part(transposed(top) @ low, 0.5))[0] < -noise:
+        return δ, np.inf
     n1, n2, n3 = frobenius(Z1), frobenius(Z2), frobenius(Z3)
     first = abs(np.dot(q, Z1 @ q))
     ratio = abs(δ) * max(n3 / n2, n2 / n1)

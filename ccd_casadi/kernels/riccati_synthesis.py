@@ -253,7 +253,7 @@ def _solved(gp, bound, backoff, guess, balanced):
     noise = RiccatiOptions.noise
     row, *K = _search_and_control(gp, lqr_hamiltonian(gp), bound, backoff, guess, noise)
     closed = row[Column.CODE] != Code.GAMMA_NOT_CONVERGED
-    if closed and OPTIONS.error_accepted < row[Column.GAMMA_ERROR] < np.inf:
+    if closed and OPTIONS.error_accepted < row[Column.GAMMA_ERROR]:
         return _with_a_better_optimum(row, K, gp, bound, backoff)
     return row, *K
 
@@ -281,8 +281,10 @@ def _with_a_better_optimum(row, K, gp, bound, backoff):
         H0, gp.B1, gp.C1, gp.d1, bound, gamma_opt, OPTIONS.gamma_tolerance, RiccatiOptions.noise
     )
     row[Column.SCHUR_FORMS] += more
-    # only what both agree on within their errors is the same optimum
-    if not (closed and left < error and abs(again - gamma_opt) <= error * again):
+    # only what both agree on within their errors is the same optimum; one whose error is not known
+    # gives way instead to one that is found to within the back-off
+    sure = closed and left < min(error, backoff - 1.0)
+    if not (sure and abs(again - gamma_opt) <= error * again):
         return row, *K
     row[Column.GAMMA_OPT], row[Column.GAMMA_ERROR] = again, left
     row[Column.LIMITED_BY_BOUND] = at_bound

@@ -26,9 +26,12 @@ class CertificateOptions:
     ----------
     unbounded : float
         A level of γ that no weighted loop reaches: the loop is measured, its norm not judged.
+    known : float
+        Relative error of γ_opt up to which it counts as found.
     """
 
     unbounded: float = 1e9
+    known: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,17 @@ class Outcome(StrEnum):
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 
 
+class Optimum(StrEnum):
+    """What is known of γ_opt: a certified controller may be far from the best one."""
+
+    FOUND = "found"
+    UNKNOWN = (
+        "not certified: rounding decides which levels pass; the optimum is between "
+        "gamma_lower_bound and gamma"
+    )
+    NOT_SEARCHED = "not searched for: the controller was given"
+
+
 _OUTCOMES = {code: Outcome[code.name] for code in Code}
 
 
@@ -127,6 +141,8 @@ class DesignFigures:
         Of the closed loop.
     compliance : float
         ‖GS‖∞ in m/N, where it was required.
+    gamma_error : float
+        Relative error that rounding may have left in γ_opt; infinite where it is not known.
     """
 
     omega_S: float
@@ -142,6 +158,15 @@ class DesignFigures:
     sensitivity_low: float
     certificate: Certificate
     compliance: float = float("nan")
+    gamma_error: float = float("nan")
+
+    @property
+    def optimum(self) -> Optimum:
+        """Whether γ_opt is known."""
+        if np.isnan(self.gamma_error):
+            return Optimum.NOT_SEARCHED
+        known = self.gamma_error <= CertificateOptions().known
+        return Optimum.FOUND if known else Optimum.UNKNOWN
 
     @property
     def certified(self) -> bool:
@@ -362,4 +387,5 @@ def figures_from_row(row: Array, weights: Weights, omega_0: float) -> DesignFigu
             norm_bound=float(row[Column.GAMMA]),
             passed=code in (Code.CERTIFIED, Code.NO_BANDWIDTH),
         ),
+        gamma_error=float(row[Column.GAMMA_ERROR]),
     )

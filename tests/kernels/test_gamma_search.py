@@ -116,7 +116,7 @@ def test_the_step_to_the_root_is_of_order_four(level) -> None:  # type: ignore[n
     for off in (0.08, 0.04, 0.02):
         t = (1.0 + off) * top
         f, slope, _, frame = at(t)
-        step, estimate = riccati.root_nearby(*parts, frame, f / (slope * t * t))
+        step, estimate = riccati.root_nearby(*parts, frame, f / (slope * t * t), NOISE)
         errors.append(abs(t / (1.0 + step * t) - top) / top)
         estimates.append(estimate * top)
     ratios = np.array(errors[:-1]) / np.array(errors[1:])
@@ -137,7 +137,7 @@ def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> 
     for off in (-0.1, -0.03, 0.03, 0.1):
         t = (1.0 + off) * top
         f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, NOISE)
-        step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t))
+        step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t), NOISE)
         assert abs(t / (1.0 + step * t) - top) < top * estimate * top
 
 
@@ -154,7 +154,7 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
     def root(H: np.ndarray) -> tuple[float, float]:
         f, slope, ok, frame = riccati.riccati_level(H, B1, C1, d1, t, NOISE)
         assert ok
-        step = riccati.root_nearby(B1, C1, d1, frame, f / (slope * t * t))[0]
+        step = riccati.root_nearby(B1, C1, d1, frame, f / (slope * t * t), NOISE)[0]
         return np.sqrt(t / (1.0 + step * t) + d1**2), gamma.rounding_error(frame, t, d1)
 
     reported, rng = root(H0)[1], np.random.default_rng(seed)

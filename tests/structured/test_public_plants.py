@@ -262,7 +262,7 @@ def test_bearings_of_a_rotor_stay_in_zone_a_with_less_bias(
         },
         "objective": {"w1": 1.0, "w2": -0.05, "cost_unit": "W"},
         "controller": {
-            "structure": "sections", "biquads": 1, "lead": 2, "roll_off": 2, "least_damping": 0.1,
+            "structure": "sections", "biquads": 1, "lead": 2, "roll_off": 2, "least_damping": 0.2,
             "starts": 16, "weighted_level": 1.0, "channel": {"a": one[0], "b": one[1]},
         },
         "loop": {"rate_hz": 1.0 / T, "delay_us": 1e6 * tau},
