@@ -54,6 +54,8 @@ class Cascade:
         Least frequency of a filter over ω_b; largest ω_b Tn and ω_b/Kv (`allowed`).
     slower : int
         N: the position's error is read at every N-th instant, and held between (`two_rates`).
+    stiff_below : float
+        rad/s up to which compliance_max holds.
     """
 
     drive: Drive
@@ -66,6 +68,7 @@ class Cascade:
     filters_above: float = 2.0
     decay: float = 4.0
     slower: int = 1
+    stiff_below: float = np.inf
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:

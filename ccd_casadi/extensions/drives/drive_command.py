@@ -74,7 +74,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         found = design_drive(
             problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
             seed=options.seed, workers=workers, options=numbers, near=near,
-            progress=lambda words: remark(words, options.quiet),
+            progress=lambda words: remark(words, options.quiet), ported=problem.ported,
         )  # fmt: skip
     text = sheet_text(found, today)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")

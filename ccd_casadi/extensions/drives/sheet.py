@@ -41,6 +41,7 @@ def entry(design: DriveDesign, today: Today | None = None) -> dict[str, Any]:
         "bandwidth_hz": design.bandwidth / HZ,
         "free_bandwidth_hz": design.free.bandwidth / HZ,
         "filter_gain": design.rise,
+        "compliance": design.compliance,
         "judge": {"passed": judged.passed, "words": judged.words, "plants": len(judged.plants),
                   "shares": bounds},
         "position_rate_hz": 1.0 / (design.cascade.period * design.cascade.slower),
@@ -78,7 +79,8 @@ def codesign_words(entry: Mapping[str, Any]) -> str:
 def proof_words(design: DriveDesign) -> str:
     """What is proven, in a sentence."""
     if design.proof is not None:
-        return design.proof.words
+        left = "" if design.compliance is None else "; compliance is judged, not proven"
+        return f"{design.proof.words}{left}"
     if len(design.certificate.plants) == 1:
         return "not needed: the set is one plant"
     return "there is none of two rates; between the judged plants nothing is proven"
@@ -103,6 +105,10 @@ def sheet_text(design: DriveDesign, today: Today | None = None) -> str:
     found.append(f"judged        {design.certificate.words}")
     found.append(f"proof         {proof_words(design)}")
     own, (Kv, _, Tn) = design.cascade, design.values[:3]
+    if design.compliance is not None:
+        until = "" if np.isinf(own.stiff_below) else f" up to {own.stiff_below / HZ:.4g} Hz"
+        found.append(f"compliance    at most {design.compliance:.4g} m/N{until} on the judged "
+                     "plants")  # fmt: skip
     lowest = design.values[own.hertz].min(initial=np.inf) / rounded
     found.append(f"filters       raise their gain to {design.rise:.4g} of rest, limit "
                  f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, limit "
