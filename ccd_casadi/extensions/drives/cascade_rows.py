@@ -5,7 +5,7 @@ force d moves what counts, z, by
 
     z/d = G_zd - G_zu Σ_j K_j G_jd/(1 + L) = (G_zd (1 + L) - Σ_j K_j G_zu G_jd)/(1 + L)
 
-with hold and delay in G_zu alone, as `lti.loop.Loop.moved` has it: one more row, where it is bounded.
+with hold and delay in G_zu alone, as `lti.loop.Loop.moved` has it: one more row, where bounded.
 """
 
 from collections.abc import Sequence
@@ -350,9 +350,7 @@ class CascadeRows:
         over = np.flatnonzero(2.0 * S**2 > 1.0)
         return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
 
-    def _figures(
-        self, one: Responses, K: np.ndarray, dK: np.ndarray | None = None
-    ) -> list[Figure]:
+    def _figures(self, one: Responses, K: np.ndarray, dK: np.ndarray | None = None) -> list[Figure]:
         """|S| at every place, and |z/d|; with slopes where those of K are given."""
         dK = np.zeros((0, *K.shape)) if dK is None else dK
         L, dL, b = one.G * K, one.G * dK, self.bounds

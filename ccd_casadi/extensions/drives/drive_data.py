@@ -76,6 +76,8 @@ class Drive:
         Kv in 1/s, velocity gain in N s/m, integral action time in s.
     slots : tuple of Slot
         Filters, in the order in which they are used.
+    speed_feedforward, force_feedforward : Setting or None
+        Of the setpoint's velocity, 1 for all of it, and of its acceleration, kg.
     sources, chosen, unknown : tuple of str
         What manuals say, what is this file's choice, and what no manual was found for.
     """
@@ -91,6 +93,8 @@ class Drive:
     sources: tuple[str, ...]
     chosen: tuple[str, ...]
     unknown: tuple[str, ...]
+    speed_feedforward: Setting | None = None
+    force_feedforward: Setting | None = None
 
     def places(self, place: str) -> tuple[Slot, ...]:
         """Its filters at a place."""
@@ -149,6 +153,8 @@ def _drive(data: dict[str, Any]) -> Drive:
                            for key in ("sources", "chosen", "unknown")}  # fmt: skip
     for key in ("position", "velocity", "integral"):
         own[key] = _setting(key, data.pop(key))
+    for key in ("speed_feedforward", "force_feedforward"):
+        own[key] = _setting(key, data.pop(key)) if key in data else None
     rule, number = Rule(data.pop("rule")), Number(data.pop("number"))
     if data["loop"] not in ("cascade", "pid"):
         raise ValueError('loop is neither "cascade" nor "pid"')

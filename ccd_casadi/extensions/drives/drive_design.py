@@ -13,6 +13,7 @@ from ccd_casadi.extensions.drives.cascade_search import (
     Search,
     on_the_grid,
 )
+from ccd_casadi.extensions.drives.drive_data import Setting
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.two_rates import judge_two_rates
 from ccd_casadi.fixed_structure.bounds import Bounds
@@ -84,6 +85,8 @@ class DriveDesign:
         Of the rounded controller; None of two rates.
     compliance : float or None
         The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
+    mass : float
+        kg that the force moves as a rigid body, at the position's sensor; 0: none.
     """
 
     cascade: Cascade
@@ -93,6 +96,22 @@ class DriveDesign:
     certificate: SetCertificate
     proof: Proof | None
     compliance: float | None = None
+    mass: float = 0.0
+
+    @property
+    def feedforward(self) -> list[tuple[Setting, float]]:
+        """What the drive has of it, with values on its grid: all of the velocity, and the mass."""
+        drive = self.cascade.drive
+        both = (drive.speed_feedforward, 1.0), (drive.force_feedforward, self.mass)
+        return [(own, own.rounded(value)) for own, value in both if own and self.mass]
+
+    @property
+    def ahead(self) -> tuple[float, float]:
+        """f and m of the program."""
+        known, drive = dict(self.feedforward), self.cascade.drive
+        f, m = (known.get(own, 0.0) if own else 0.0
+                for own in (drive.speed_feedforward, drive.force_feedforward))  # fmt: skip
+        return f, m
 
     @property
     def status(self) -> str:
@@ -191,7 +210,8 @@ def design_drive(
             break
     cascade.require_fit(rounded.values)
     most = None if moved is None else float(moved.max())
-    return DriveDesign(cascade, rounded.values, band, free, judged, proof, most)
+    return DriveDesign(cascade, rounded.values, band, free, judged, proof, most,
+                       rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 
 def _design_two_rates(
@@ -224,7 +244,8 @@ def _design_two_rates(
     assert free is not None
     cascade.require_fit(rounded.values)
     band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
-    return DriveDesign(cascade, rounded.values, band, free, judged, None)
+    return DriveDesign(cascade, rounded.values, band, free, judged, None,
+                       mass=rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 
 def _tighter(bounds: Bounds, peak: float, low: float) -> Bounds:
@@ -296,6 +317,15 @@ def require_known(cascade: Cascade, bounds: Bounds) -> None:
     if bounds.compliance_max is not None and cascade.slower > 1:
         words = "compliance_max does not go with a slower position loop"
         raise UserError(f"{words}; leave out that or position_rate_hz")
+
+
+def rigid_mass(uncertain: UncertainPlant, position: int) -> float:
+    """kg that the model's force moves as rigid bodies at the position's sensor; 0: none."""
+    modal = uncertain.modal(0)
+    if modal.states is not None:
+        return 0.0
+    per_force = float(modal.C[position, modal.rigid] @ modal.B[modal.rigid, 0])
+    return 1.0 / per_force if per_force > 0.0 else 0.0
 
 
 def first_points(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
