@@ -42,6 +42,8 @@ ROWS: dict[str, tuple[str, float, dict[str, Any]]] = {
     "one notch": ("both", 0.03, {"name": "synapticon", "filters": 1, "setpoint_filters": 0}),
     "two of each": ("both", 0.03, {"name": "generic", "filters": 2, "setpoint_filters": 2}),
     "ball screw": ("screw", 0.03, {}),
+    "feed drive": ("feed", 0.03, {}),
+    "feed drive by its scale": ("scale", 0.03, {}),
 }
 
 
@@ -49,6 +51,15 @@ def case_of(sensors: str, shift: float, differs: dict[str, Any]) -> Case:
     """The example with other sensors, set or drive; or a screw of 0.3 to 0.9 m, 100 to 400 kg."""
     data = read_toml(EXAMPLE)
     data["drive"] |= differs
+    if sensors in ("feed", "scale"):
+        path = EXAMPLE.parents[1] / "feed_drive/case.toml"
+        data = read_toml(path)
+        if sensors == "scale":  # its compliance is five times as large
+            data["plant"]["sensor"] = "table"
+            data["inner"]["compliance_max"] *= 5.0
+            del data["controller"]["bandwidth_of"], data["controller"]["channel"]
+            del data["drive"]["velocity"]
+        return parse_case(data, path)
     if sensors == "screw":
         path = EXAMPLE.parents[1] / "two_encoders/case.toml"
         data = {**read_toml(path), "drive": data["drive"]}
@@ -71,7 +82,7 @@ def main(names: list[str]) -> None:
     for name in names or [*ROWS]:
         it, started = drive_problem(case_of(*ROWS[name])), perf_counter()
         try:
-            found = design_drive(it.cascade, it.uncertain, it.bounds, it.sampling)
+            found = design_drive(it.cascade, it.uncertain, it.bounds, it.sampling, ported=it.ported)
         except UserError as error:
             print(f"{name:26s}{error}", flush=True)
             continue

@@ -271,7 +271,7 @@ class DriveTable:
         check=checks.number(0.1, 1e9, "give 0.1 to 1e9", closed=True),
     )
     compliance_hz: float | None = key(
-        "frequency up to which inner.compliance_max holds; absent: every one",
+        "inner.compliance_max holds up to this",
         None,
         unit="Hz",
         check=checks.number(0.0, 1e9, "give more than 0"),

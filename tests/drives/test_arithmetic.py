@@ -18,8 +18,7 @@ from ccd_casadi.extensions.drives.arithmetic import (
     program_of,
 )
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive_data import read_drive
-from ccd_casadi.extensions.drives.forms import Number
+from ccd_casadi.extensions.drives.drive_data import Number, read_drive
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace as Plant
 

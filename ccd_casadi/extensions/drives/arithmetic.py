@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.forms import Number
+from ccd_casadi.extensions.drives.drive_data import Number
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 

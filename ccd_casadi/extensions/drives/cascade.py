@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot
-from ccd_casadi.extensions.drives.forms import FORMS, Filter
+from ccd_casadi.extensions.drives.drive_data import FORMS, Drive, Filter, Setting, Slot
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

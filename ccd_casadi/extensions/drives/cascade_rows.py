@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.forms import Filter, Number
+from ccd_casadi.extensions.drives.drive_data import Filter, Number
 from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, held, sampled
@@ -355,7 +355,8 @@ class CascadeRows:
         dK = np.zeros((0, *K.shape)) if dK is None else dK
         L, dL, b = one.G * K, one.G * dK, self.bounds
         D, dD = 1.0 + L.sum(axis=0), dL.sum(axis=1)
-        own, found = {c.name: c.S_max or b.S_max for c in b.channels}, []
+        own = {c.name: c.S_max or b.S_max for c in b.channels}
+        found: list[tuple[int | str | None, np.ndarray, np.ndarray, float | Array]] = []
         for place in self._places():
             rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
             name = "actuator" if place is None else self._name(place)

@@ -174,7 +174,8 @@ def design_drive(
     if cascade.slower > 1:
         return _design_two_rates(cascade, uncertain, bounds, sampling, seed, progress, options,
                                  near)  # fmt: skip
-    of_S, wide, points = replace(bounds, compliance_max=None), ported or uncertain, []
+    of_S, wide = replace(bounds, compliance_max=None), ported or uncertain
+    points: list[tuple[int, Array]] = []
     new, unproven = first_points(uncertain), bool(uncertain.ranges) or wide is ported
     draws = options.draws_unproven if unproven else options.draws
     progress(f"searching {options.search.starts} starts on {counted(len(new), 'plant')}")
@@ -190,7 +191,8 @@ def design_drive(
         tried = [*points, *uncertain.drawn(np.random.default_rng([seed, draws]), draws)]
         judged = judge(cascade, rounded.values, uncertain, of_S, sampling, tried, workers)
         moved = None if ported is None else moved_by_forces(
-            cascade, rounded.values, ported.as_written(tried), sampling)  # fmt: skip
+            cascade, rounded.values, ported.as_written(tried), sampling,
+            options.search.lowest * bounds.omega_low)  # fmt: skip
         if moved is not None and bounds.compliance_max is not None:
             judged = with_compliance(judged, moved, bounds.compliance_max)
         band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
@@ -208,6 +210,7 @@ def design_drive(
             new += [tried[i] for i in worst if over[i] > options.lower and i >= len(points)]
         if not new:
             break
+    assert free is not None
     cascade.require_fit(rounded.values)
     most = None if moved is None else float(moved.max())
     return DriveDesign(cascade, rounded.values, band, free, judged, proof, most,
@@ -269,21 +272,18 @@ def judge(
 
 
 def moved_by_forces(
-    cascade: Cascade, values: Array, plants: Sequence[StateSpace], sampling: Sampling
+    cascade: Cascade, values: Array, plants: Sequence[StateSpace], sampling: Sampling, lowest: float
 ) -> Array:
-    """The largest |z/d| of every plant with its ports, m/N, up to `stiff_below`; inf: unstable."""
+    """The largest |z/d| of every plant with its ports, m/N, from `lowest` (rad/s; below it the
+    integrator lets it fall, and free bodies cost it its digits) to `stiff_below`; inf: unstable."""
     found, K = [], cascade.state_space(values)
     for plant in plants:
         sensed, drive, counted = split(plant, cascade)
         loop = Loop(sensed, K, sampling, drive=drive, counted=counted)
-        if not loop.stable:
-            found.append(np.inf)
-        elif np.isinf(cascade.stiff_below):
-            found.append(loop.compliance)
-        else:
-            omega = loop.grid()
-            omega = np.append(omega[omega < cascade.stiff_below], cascade.stiff_below)
-            found.append(float(np.abs(loop.moved(omega)).max()))
+        omega = loop.grid() if loop.stable else np.zeros(0)
+        omega = np.append(omega, min(cascade.stiff_below, np.pi / sampling.period * 0.999))
+        omega = omega[(omega >= lowest) & (omega <= cascade.stiff_below)]
+        found.append(float(np.abs(loop.moved(omega)).max()) if loop.stable else np.inf)
     return np.array(found)
 
 
