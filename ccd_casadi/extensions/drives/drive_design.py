@@ -205,7 +205,7 @@ def design_drive(
             proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
         new = [(proof.option, np.array(proof.point))] if proof.refuted else []
         if unproven:
-            over = excesses(judged, of_S, rounded.bandwidth, moved, bounds.compliance_max)
+            over = excesses(judged, bounds, rounded.bandwidth)
             worst = np.argsort(-over)[: options.added]
             new += [tried[i] for i in worst if over[i] > options.lower and i >= len(points)]
         if not new:
@@ -288,26 +288,24 @@ def moved_by_forces(
 
 
 def with_compliance(judged: SetCertificate, moved: Array, most: float) -> SetCertificate:
-    """A certificate with what forces move, as one more figure over its bound."""
-    share = float(moved.max() / most)
-    over, words = share > 1.0 + JudgeOptions().tolerance, judged.words
+    """A certificate with what forces move in the place of GS, over its bound."""
+    plants = tuple(replace(one, GS=m) for one, m in zip(judged.plants, moved.tolist(), strict=True))
+    share, words = float(moved.max() / most), judged.words
+    over = share > 1.0 + JudgeOptions().tolerance
     if over:
         words = f"exceeds compliance_max by {100.0 * (share - 1.0):.2g} %; of |S|: {words}"
-    return replace(judged, passed=judged.passed and not over, words=words,
-                   worst=judged.worst | {"compliance": share})  # fmt: skip
+    return replace(judged, passed=judged.passed and not over, words=words, plants=plants,
+                   worst=judged.worst | {"GS": share})  # fmt: skip
 
 
-def excesses(
-    judged: SetCertificate, bounds: Bounds, bandwidth: float, moved: Array | None,
-    most: float | None,
-) -> Array:  # fmt: skip
+def excesses(judged: SetCertificate, bounds: Bounds, bandwidth: float) -> Array:
     """By which share every plant exceeds its worst bound, or falls short of the bandwidth."""
     found = np.full(len(judged.plants), np.inf)
     for i, one in enumerate(judged.plants):
         if one.stable:
             shares = bounds.shares(one) | bounds.channel_shares(one.channels)
             found[i] = max(*shares.values(), bandwidth / one.bandwidth) - 1.0
-    return found if moved is None else np.maximum(found, moved / (most or np.inf) - 1.0)
+    return found
 
 
 def require_known(cascade: Cascade, bounds: Bounds) -> None:
