@@ -54,9 +54,9 @@ def case_of(sensors: str, shift: float, differs: dict[str, Any]) -> Case:
     if sensors in ("feed", "scale"):
         path = EXAMPLE.parents[1] / "feed_drive/case.toml"
         data = read_toml(path)
-        if sensors == "scale":  # its compliance is five times as large
+        if sensors == "scale":
             data["plant"]["sensor"] = "table"
-            data["inner"]["compliance_max"] *= 5.0
+            data["inner"]["compliance_max"] *= 12.0
             del data["controller"]["bandwidth_of"], data["controller"]["channel"]
             del data["drive"]["velocity"]
         return parse_case(data, path)

@@ -18,7 +18,7 @@ from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.drive_data import Filter, Number
 from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.lti.loop import Sampling, held, sampled
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 
@@ -196,7 +196,8 @@ class CascadeRows:
                 continue
             C = np.vstack([plant.C, counted])
             d = strictly_proper(plant.A, drive, C).swept(omega)[:, :, 0].T
-            u = held(strictly_proper(plant.A, plant.B, counted), omega, self.sampling)[:, 0, 0]
+            late = strictly_proper(plant.A, plant.B, counted)
+            u = sampled(late, self.period, self.sampling.delay).swept(omega)[:, 0, 0]
             limit = np.where(omega <= self.cascade.stiff_below, most, np.inf)
             found.append(Responses(G, (d[-1], u * d[:-1], limit)))
         return found
