@@ -270,6 +270,12 @@ class DriveTable:
         4.0,
         check=checks.number(0.1, 1e9, "give 0.1 to 1e9", closed=True),
     )
+    compliance_hz: float | None = key(
+        "inner.compliance_max holds up to this",
+        None,
+        unit="Hz",
+        check=checks.number(0.0, 1e9, "give more than 0"),
+    )
 
 
 @dataclass(frozen=True)

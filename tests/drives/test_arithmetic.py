@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 from oracles import drive_simulation as oracle
 
-from ccd_casadi.extensions.drives.arithmetic import Program, program_of
+from ccd_casadi.extensions.drives.arithmetic import (
+    ArithmeticOptions,
+    Program,
+    following_error,
+    program_of,
+)
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive_data import read_drive
-from ccd_casadi.extensions.drives.forms import Number
+from ccd_casadi.extensions.drives.drive_data import Number, read_drive
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import StateSpace as Plant
 
 RATE = 8000.0
 GAINS = (250.0, 31.25, 0.02)
@@ -29,9 +35,12 @@ def cascade(name: str) -> Cascade:
     return Cascade(drive, 1.0 / RATE, slots, 1, 0, 2)
 
 
-def program(name: str, slower: int = 1) -> Program:
+AHEAD = (0.97, 0.11)  # of the velocity, and kg
+
+
+def program(name: str, slower: int = 1, ahead: tuple[float, float] = AHEAD) -> Program:
     own = replace(cascade(name), slower=slower)
-    return program_of(own, np.array([*GAINS, *np.ravel(FILTERS)]))
+    return program_of(own, np.array([*GAINS, *np.ravel(FILTERS)]), ahead)
 
 
 def signals(count: int = 600) -> np.ndarray:
@@ -54,7 +63,7 @@ def simulated(name: str, slower: int = 1) -> list:
         else:
             made.append(oracle.float_filter([real(float(x)) for x in c]))
     split = count[0] - count[1]
-    return oracle.force(GAINS, made[split:], made[:split], RATE, real, signals(), slower)
+    return oracle.force(GAINS, made[split:], made[:split], RATE, real, signals(), slower, AHEAD)
 
 
 @pytest.mark.parametrize("slower", [1, 4])
@@ -114,4 +123,20 @@ def test_the_program_answers_as_its_state_space() -> None:
     for e in errors.T:
         found.append(float((K.C @ x + K.D @ e)[0]))
         x = K.A @ x + K.B @ e
-    np.testing.assert_allclose(found, program("generic").run(*rows.T), rtol=1e-8, atol=1e-12)
+    without = program("generic", ahead=(0.0, 0.0)).run(*rows.T)
+    np.testing.assert_allclose(found, without, rtol=1e-8, atol=1e-12)
+
+
+def test_feedforward_of_a_rigid_mass_leaves_what_its_fourth_derivative_makes() -> None:
+    """Without, it is the velocity over Kv. At half the speed a jerk's would be an eighth."""
+    mass = Plant(*map(np.array, ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0 / 0.11]],
+                                 [[1.0, 0.0], [1.0, 0.0]], np.zeros((2, 1)))))  # fmt: skip
+    G, own = sampled(mass, 1.0 / RATE, 375e-6), replace(cascade("generic"), slots=())
+    errors = []
+    for seconds, ahead in ((0.4, (0.0, 0.0)), (0.4, (1.0, 0.11)), (0.8, (1.0, 0.11))):
+        made = program_of(own, np.array(GAINS), ahead, ArithmeticOptions(seconds=seconds))
+        errors.append(following_error(made, G, 1, 0))
+    fastest = 35.0 / 16.0 * ArithmeticOptions().distance / 0.4
+    assert errors[0] == pytest.approx(fastest / GAINS[0], rel=0.1)
+    assert errors[1] < 0.02 * errors[0]
+    assert errors[1] > 10.0 * errors[2]  # 11.5

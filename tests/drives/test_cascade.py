@@ -1,5 +1,6 @@
 """Cascades of drives: files, responses and slopes, rounding, search and proof."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -9,16 +10,27 @@ from bench import RATE, SLOW, bounds, cascade, uncertain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
+from ccd_casadi.extensions.drives.cascade_rows import FORCE, SearchOptions
 from ccd_casadi.extensions.drives.cascade_search import Search
-from ccd_casadi.extensions.drives.drive_data import known_drives, read_drive
-from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive, require_known
-from ccd_casadi.extensions.drives.forms import FORMS, Filter, Number, Rule
+from ccd_casadi.extensions.drives.drive_data import (
+    FORMS,
+    Filter,
+    Number,
+    Rule,
+    known_drives,
+    read_drive,
+)
+from ccd_casadi.extensions.drives.drive_design import (
+    DriveOptions,
+    design_drive,
+    moved_by_forces,
+    require_known,
+)
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.sampled_model import SampledModel
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome
 from ccd_casadi.lti.loop import sampled
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
@@ -128,9 +140,10 @@ def test_what_is_not_a_polynomial_here_is_not_proven() -> None:
     assert proof.outcome is ProofOutcome.VARIES
 
 
-def test_rows_have_exact_slopes() -> None:
-    plants = [uncertain().plant(np.array([p])).plant_si() for p in (-0.03, 0.03)]
-    search = Search(cascade(), bounds(), RATE, plants, SearchOptions(points=20))
+@pytest.mark.parametrize("most", [None, 1e-5])
+def test_rows_have_exact_slopes(most: float | None) -> None:
+    plants = [pushed(uncertain().plant(np.array([p])).plant_si()) for p in (-0.03, 0.03)]
+    search = Search(cascade(), bounds(compliance_max=most), RATE, plants, SearchOptions(points=20))
     here, band = np.log(SLOW), np.log(20.0 * HZ)
     _, slopes = search.rows(here, band)
     for i in range(len(here) + 1):
@@ -229,6 +242,50 @@ def test_a_drive_that_is_not_there_is_named() -> None:
         read_drive("sinamics")
 
 
-def test_bounds_without_rows_are_refused() -> None:
-    with pytest.raises(UserError, match="compliance_max"):
-        require_known(bounds(compliance_max=1e-6))
+@pytest.mark.parametrize(
+    ("other", "slower", "words"),
+    [({"weighted_level": 2.0, "weights": object()}, 1, "weighted_level"),
+     ({"compliance_max": 1e-6}, 2, "position_rate_hz")],
+)  # fmt: skip
+def test_bounds_without_rows_are_refused(other: dict, slower: int, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        require_known(replace(cascade(), slower=slower), bounds(**other))
+
+
+def pushed(plant: StateSpace) -> StateSpace:
+    """A second force, at the load (0.0771 kg), and what it moves there."""
+    n, u, y = len(plant.A) // 2, plant.B[:, 0], plant.C
+    at_load = np.linalg.solve(y[:, :n], [0.0, 1.0 / 0.0771])  # the modes' accelerations
+    B = np.column_stack([u, np.concatenate([np.zeros(n), at_load])])
+    return StateSpace(plant.A, B, np.vstack([y, y[[1]]]), np.zeros((3, 2)))
+
+
+def test_what_a_force_moves_is_the_judges_and_that_of_a_simulation() -> None:
+    """Rows of the search, `Loop.moved`, and a loop that is closed sample by sample."""
+    hertz, plant = 20.0, pushed(model())
+    own = replace(cascade(), stiff_below=hertz * HZ)
+    search = Search(own, bounds(compliance_max=1.0), RATE, [plant], SearchOptions())
+    search.on(np.array([1.0, hertz, 100.0]) * HZ)
+    (row,) = (one for one in search._figures(search.seen[0], own.responses(SLOW, search.z)[0])
+              if one.place == FORCE)  # fmt: skip
+    assert np.isinf(row.limit).tolist() == [False, False, True]
+    (most,) = moved_by_forces(own, SLOW, [plant], RATE, HZ)
+    assert most == pytest.approx(row.size[:2].max(), rel=0.02)  # largest at 20 Hz, or near it
+    K, T, count = own.state_space(SLOW), RATE.period, 4000
+    G = sampled(strictly_proper(plant.A, plant.B[:, :1], plant.C[:2]), T, RATE.delay)
+    parts, n = 8, len(plant.A)  # of a period, in which the force is constant
+    fine = sampled(plant, T / parts, 0.0)
+    x, k, old, z = np.zeros(n), np.zeros(len(K.A)), [0.0] * 3, []
+    assert len(G.A) == n + 3  # the delay is three whole periods
+    for i in range(count):
+        y = plant.C @ x
+        z.append(y[2])
+        old.append(float((K.C @ k - K.D @ y[:2])[0]))
+        k = K.A @ k - K.B @ y[:2]
+        u = old.pop(0)
+        for j in range(parts):
+            d = np.sin(hertz * HZ * T * (i + (j + 0.5) / parts))
+            x = fine.A @ x + fine.B @ np.array([u, d])
+    tail = slice(count - 2000, count)
+    turn = np.exp(-1j * hertz * HZ * T * np.arange(count))[tail]
+    assert 2.0 * abs(np.mean(np.array(z)[tail] * turn)) == pytest.approx(row.size[1], rel=2e-3)

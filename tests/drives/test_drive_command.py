@@ -4,12 +4,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drive import main
+from ccd_casadi.extensions.drives.cascade_rows import split
 from ccd_casadi.extensions.drives.drive_case import drive_problem
+from ccd_casadi.extensions.drives.drive_design import rigid_mass
 from ccd_casadi.support.errors import UserError
 
 EXAMPLE = Path(__file__).parents[2] / "examples/drive_bench/case.toml"
@@ -31,7 +34,9 @@ def changed(**tables: dict[str, Any]) -> dict[str, Any]:
         ({"drive": {"velocity": "spindle"}}, "one of motor, load"),
         ({"drive": {"position_rate_hz": 3000.0}}, "no whole part of loop.rate_hz"),
         ({"drive": {"position_rate_hz": 2.0}}, "at most twice inner.omega_low_hz"),
-        ({"controller": {"compliance_max": 1e-5}}, "compliance_max"),
+        ({"inner": {"compliance_max": 1e-5}, "drive": {"position_rate_hz": 2000.0}},
+         "compliance_max does not go with a slower position loop"),
+        ({"controller": {"weighted_level": 2.0}}, "weighted_level"),
     ],
 )
 def test_what_does_not_go_with_a_drive_is_named(
@@ -39,6 +44,29 @@ def test_what_does_not_go_with_a_drive_is_named(
 ) -> None:
     with pytest.raises(UserError, match=words):
         drive_problem(parse_case(changed(**tables), EXAMPLE))
+
+
+FEED = EXAMPLE.parents[1] / "feed_drive/case.toml"
+
+
+def test_a_force_at_the_table_is_bounded_on_plants_that_vary() -> None:
+    found = drive_problem(parse_case(read_toml(FEED), FEED))
+    assert found.uncertain.names[2:] == ("theta.at", "theta.load")
+    assert found.bounds.compliance_max == 1.6e-8
+    assert found.ported is not None
+    plant = found.ported.plant(found.ported.nominal).plant_si()
+    _, drive, counted = split(plant, found.cascade)
+    w = 1e-3
+    moved = counted @ np.linalg.solve(1j * w * np.eye(len(plant.A)) - plant.A, drive)
+    mass = rigid_mass(found.uncertain, found.cascade.position)
+    assert abs(moved[0, 0]) * w**2 == pytest.approx(1.0 / mass, rel=1e-3)
+
+
+def test_a_force_that_nothing_bounds_is_named() -> None:
+    data = read_toml(FEED)
+    del data["inner"]["compliance_max"]
+    with pytest.raises(UserError, match="without inner"):
+        drive_problem(parse_case(data, FEED))
 
 
 def test_other_commands_refuse_a_case_with_a_drive() -> None:
@@ -67,7 +95,8 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     assert (answer["status"] == "verified") == (
         answer["judge"]["passed"] and answer["proof"]["proven"]
     )
-    assert len(answer["parameters"]) == 11
+    assert len(answer["parameters"]) == 13
+    assert answer["following_error"]["m"] < 0.2 * answer["following_error"]["without_m"]
     sheet = (out / "sheet.txt").read_text("utf-8")
     assert "p1417" in sheet
     assert "500" in sheet
@@ -76,5 +105,5 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     for row in answer["parameters"]:  # each block of the diagram, as the drive names and writes it
         assert f"{row['number']} {row['name'].split(', ')[-1]}".strip() in page
         assert f">{row['value']:.10g}<" in page
-    assert [row["today"] for row in answer["parameters"]].count(None) == 9
+    assert [row["today"] for row in answer["parameters"]].count(None) == 11
     assert "cascade_step" in (out / "cascade.c").read_text("utf-8")

@@ -67,18 +67,23 @@ def float_filter(c: Sequence[Any]) -> Callable[[Any], Any]:
 def controller(
     gains: tuple[float, float, float], setpoint: list[Callable[[Any], Any]],
     current: list[Callable[[Any], Any]], rate_hz: float, real: Callable[[Any], Any],
-    slower: int = 1,
+    slower: int = 1, ahead: tuple[float, float] = (0.0, 0.0),
 ) -> Callable[[float, float, float], Any]:  # fmt: skip
-    """u of (reference, position, motor), call after call: Kv in 1/s, Kp, Tn in s."""
+    """u of (reference, position, motor), call after call: Kv in 1/s, Kp, Tn in s; `ahead`: the
+    share of the reference's velocity, and kg of its acceleration, that are fed forward."""
     Kv, Kp, Tn = gains
     share, rate = real(1.0 / rate_hz / Tn), real(rate_hz)
-    s: dict[str, Any] = {"integral": real(0.0), "before": None, "call": 0}
+    s: dict[str, Any] = {"integral": real(0.0), "before": None, "call": 0, "fast": real(0.0)}
+    per_call = real(ahead[1] * rate_hz)
 
     def step(reference: float, position: float, motor: float) -> Any:
         if s["call"] % slower == 0:
             s["read"] = real(Kv) * (real(reference) - real(position))
         s["call"] += 1
-        wanted = s["read"]
+        to = real(reference)
+        s.setdefault("from", to)
+        fast = (to - s["from"]) * rate
+        wanted, s["from"] = s["read"] + real(ahead[0]) * fast, to
         for one in setpoint:
             wanted = one(wanted)
         here = real(motor)
@@ -86,7 +91,8 @@ def controller(
         s["before"] = here
         error = wanted - speed
         s["integral"] = s["integral"] + share * error
-        u = real(Kp) * (error + s["integral"])
+        u = real(Kp) * (error + s["integral"]) + per_call * (fast - s["fast"])
+        s["fast"] = fast
         for one in current:
             u = one(u)
         return u
@@ -97,8 +103,8 @@ def controller(
 def force(
     gains: tuple[float, float, float], setpoint: list[Callable[[Any], Any]],
     current: list[Callable[[Any], Any]], rate_hz: float, real: Callable[[Any], Any],
-    signals: np.ndarray, slower: int = 1,
+    signals: np.ndarray, slower: int = 1, ahead: tuple[float, float] = (0.0, 0.0),
 ) -> list[Any]:  # fmt: skip
     """u of rows (reference, position, motor)."""
-    step = controller(gains, setpoint, current, rate_hz, real, slower)
+    step = controller(gains, setpoint, current, rate_hz, real, slower, ahead)
     return [step(*row) for row in signals.tolist()]

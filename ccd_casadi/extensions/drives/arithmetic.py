@@ -1,17 +1,25 @@
 """A cascade's difference equations as they run: in Python, and the same as C.
 
-Counts of the encoders in, force out. Gains and the PI compute in the drive's floating point; a
+Counts of the encoders in, force out. Of the setpoint r the velocity is added to what the position
+controller wants, and the acceleration times the mass to the PI's force:
+
+    v = F_s (Kv e + f (r_k - r_{k-1})/T),   u = F_c (PI(v - v_m) + m (r_k - 2r_{k-1} + r_{k-2})/T²)
+
+With f = 1 and m the rigid mass the error falls with the jerk no more: what the delays leave follows
+the fourth derivative. Gains and the PI compute in the drive's floating point; a
 fixed-point filter takes and gives integers of `grain` N, its products summed in 64 bits and shifted
 right by 30, towards minus infinity.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.forms import Number
+from ccd_casadi.extensions.drives.drive_data import Number
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 
@@ -25,10 +33,15 @@ class ArithmeticOptions:
         N, of an integer of a fixed-point filter's signal.
     bits : int
         Of its coefficients' fraction.
+    distance, seconds, rest : float
+        m and s of the move that is simulated, and s of what follows.
     """
 
     grain: float = 2.0**-20
     bits: int = 30
+    distance: float = 0.01
+    seconds: float = 0.2
+    rest: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,8 @@ class Program:
     options : ArithmeticOptions
     slower : int
         Calls to one of the position loop.
+    ahead, push : float
+        f, and m/T in kg/s.
     """
 
     kind: Number
@@ -59,27 +74,41 @@ class Program:
     current: tuple[tuple[Any, ...], ...]
     options: ArithmeticOptions
     slower: int = 1
+    ahead: float = 0.0
+    push: float = 0.0
 
     def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
         """Force at every instant, of the reference and both sensors in m as the drive has them."""
+        step = self.started()
+        return [step(*row) for row in zip(reference, position, motor, strict=True)]
+
+    def started(self) -> Callable[[float, float, float], Any]:
+        """The program at rest: the force of (r, y, m), call after call."""
         real = self.real
         states = {id(own): [0, 0, 0, 0] if self._fixed else [real(0)] * 4
                   for own in (*self.setpoint, *self.current)}  # fmt: skip
-        last, total, held, found = real(motor[0]), real(0), real(0), []
-        for k, (r, y, m) in enumerate(zip(reference, position, motor, strict=True)):
-            if k % self.slower == 0:
-                held = real(self.Kv) * (real(r) - real(y))
-            v = held
+        last, before, speed, total, held, call = None, None, real(0), real(0), real(0), 0
+
+        def step(reference: float, position: float, motor: float) -> Any:
+            nonlocal last, before, speed, total, held, call
+            r, m = real(reference), real(motor)
+            last, before = m if last is None else last, r if before is None else before
+            if call % self.slower == 0:
+                held = real(self.Kv) * (r - real(position))
+            call += 1
+            fast = (r - before) * real(self.rate)
+            v = held + real(self.ahead) * fast
             for own in self.setpoint:
                 v = self._filtered(own, states[id(own)], v)
-            w = v - (real(m) - last) * real(self.rate)
-            last = real(m)
+            w = v - (m - last) * real(self.rate)
             total = total + real(self.share) * w
-            u = real(self.Kp) * (w + total)
+            u = real(self.Kp) * (w + total) + real(self.push) * (fast - speed)
+            last, before, speed = m, r, fast
             for own in self.current:
                 u = self._filtered(own, states[id(own)], u)
-            found.append(u)
-        return found
+            return u
+
+        return step
 
     @property
     def _often(self) -> str:
@@ -113,7 +142,10 @@ class Program:
         count, n = len(rows), len(self.setpoint)
         inside = ("x = llrint(u / GRAIN)", f"y >>= {self.options.bits}", "(real)(y * GRAIN)") \
             if self._fixed else ("x = u", "", "y")  # fmt: skip
-        gains = [f"{float(g)!r}{suffix}" for g in (self.Kv, self.Kp, self.share, self.rate)]
+        gains = [
+            f"{float(g)!r}{suffix}"
+            for g in (self.Kv, self.Kp, self.share, self.rate, self.ahead, self.push)
+        ]
         return f"""/* {title}: position, velocity and filters of a drive,
    one call each period{self._often}.
    cc -std=c99 -O2 -ffp-contract=off; right shifts of negative integers are arithmetic. */
@@ -125,7 +157,7 @@ class Program:
 typedef {real} real;
 typedef {number} number;
 typedef struct {{
-    real last, total, held;
+    real last, total, held, before, speed;
     int begun, call;
     number old[{max(count, 1)}][4];
 }} cascade_state;
@@ -148,17 +180,20 @@ void cascade_reset(cascade_state *s) {{ memset(s, 0, sizeof *s); }}
 /* r, y: setpoint and sensor of the position, m: the motor's sensor, m; the force, N. */
 real cascade_step(cascade_state *s, real r, real y, real m)
 {{
-    real v, w, u;
+    real v, w, u, fast;
     int i;
     if (s->call == 0) s->held = {gains[0]} * (r - y);
     s->call = (s->call + 1) % {self.slower};
-    v = s->held;
-    if (!s->begun) {{ s->last = m; s->begun = 1; }}
+    if (!s->begun) {{ s->last = m; s->before = r; s->begun = 1; }}
+    fast = (r - s->before) * {gains[3]};
+    s->before = r;
+    v = s->held + {gains[4]} * fast;
     for (i = 0; i < {n}; i++) v = filtered(FILTERS[i], s->old[i], v);
     w = v - (m - s->last) * {gains[3]};
     s->last = m;
     s->total = s->total + {gains[2]} * w;
-    u = {gains[1]} * (w + s->total);
+    u = {gains[1]} * (w + s->total) + {gains[5]} * (fast - s->speed);
+    s->speed = fast;
     for (i = {n}; i < {count}; i++) u = filtered(FILTERS[i], s->old[i], u);
     return u;
 }}
@@ -166,14 +201,17 @@ real cascade_step(cascade_state *s, real r, real y, real m)
 
 
 def program_of(
-    cascade: Cascade, values: Array, options: ArithmeticOptions = ArithmeticOptions()
-) -> Program:
+    cascade: Cascade, values: Array, ahead: tuple[float, float] = (0.0, 0.0),
+    options: ArithmeticOptions = ArithmeticOptions(),
+) -> Program:  # fmt: skip
     """The program of a cascade with rounded values.
 
     Parameters
     ----------
     cascade, values : Cascade, array (n,)
         SI.
+    ahead : (float, float)
+        f, and m in kg; 0: no feedforward.
     options : ArithmeticOptions
 
     Returns
@@ -195,4 +233,33 @@ def program_of(
     share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
     return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
                    tuple(own["setpoint"]), tuple(own["current"]), options,
-                   cascade.slower)  # fmt: skip
+                   cascade.slower, float(real(ahead[0])),
+                   float(real(ahead[1] / cascade.period)))  # fmt: skip
+
+
+def following_error(program: Program, plant: StateSpace, position: int, velocity: int) -> float:
+    """Simulate a move and find how far the position is behind its setpoint at most.
+
+    The setpoint is the polynomial of seventh order from rest to rest. Sensors are exact.
+
+    Parameters
+    ----------
+    program : Program
+    plant : StateSpace
+        From force to all sensors at the program's rate (`lti.loop.sampled`).
+    position, velocity : int
+        Numbers of the sensors.
+
+    Returns
+    -------
+    float
+        m.
+    """
+    o, step, x, worst = program.options, program.started(), np.zeros(len(plant.A)), 0.0
+    for k in range(round((o.seconds + o.rest) * program.rate)):
+        t = min(k / program.rate / o.seconds, 1.0)
+        r = o.distance * t**4 * (35.0 - 84.0 * t + 70.0 * t**2 - 20.0 * t**3)
+        y = plant.C @ x
+        worst = max(worst, abs(r - y[position]))
+        x = plant.A @ x + plant.B[:, 0] * float(step(r, y[position], y[velocity]))
+    return float(worst)

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot
-from ccd_casadi.extensions.drives.forms import FORMS, Filter
+from ccd_casadi.extensions.drives.drive_data import FORMS, Drive, Filter, Setting, Slot
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -54,6 +53,8 @@ class Cascade:
         Least frequency of a filter over ω_b; largest ω_b Tn and ω_b/Kv (`allowed`).
     slower : int
         N: the position's error is read at every N-th instant, and held between (`two_rates`).
+    stiff_below : float
+        rad/s up to which compliance_max holds.
     """
 
     drive: Drive
@@ -66,6 +67,7 @@ class Cascade:
     filters_above: float = 2.0
     decay: float = 4.0
     slower: int = 1
+    stiff_below: float = np.inf
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:

@@ -1,20 +1,28 @@
 """|S| of a cascade at every place over its bound, on some plants and a grid of frequencies.
 
-Rows are ln of |S| over its bound, with the exact slopes of the drive's own difference equations.
+Rows are ln of |S| over its bound, with the exact slopes of the drive's own difference equations. A
+force d moves what counts, z, by
+
+    z/d = G_zd - G_zu Σ_j K_j G_jd/(1 + L) = (G_zd (1 + L) - Σ_j K_j G_zu G_jd)/(1 + L)
+
+with hold and delay in G_zu alone, as `lti.loop.Loop.moved` has it: one more row, where bounded.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.forms import Filter, Number
+from ccd_casadi.extensions.drives.drive_data import Filter, Number
 from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, sampled
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
+
+FORCE = "force"  # the place of z/d
 
 
 @dataclass(frozen=True)
@@ -98,6 +106,42 @@ class SearchOptions:
     edge: float = 1e-9
 
 
+class Responses(NamedTuple):
+    """A plant on a grid: G (p, k) of the sensors as they are sampled; where z/d is bounded G_zd
+    (k,), G_zu G_jd (p, k) and the bound (k,)."""
+
+    G: np.ndarray
+    forces: tuple[np.ndarray, np.ndarray, Array] | None = None
+
+
+class Figure(NamedTuple):
+    """A figure |N/D| at a place, its bound, and the slopes (k, n) of its ln."""
+
+    place: int | str | None
+    size: Array
+    limit: float | Array
+    slopes: Array
+
+
+def split(plant: StateSpace, cascade: Cascade) -> tuple[StateSpace, Array, Array]:
+    """Take apart a plant with its ports: from the drive's force to the sensors, where forces act,
+    and what counts; without ports the drive's force itself, and the position's sensor.
+
+    Parameters
+    ----------
+    plant, cascade : StateSpace, Cascade
+
+    Returns
+    -------
+    sensed : StateSpace
+    drive, counted : array (n, q), (z, n)
+    """
+    p = cascade.sensors
+    drive = plant.B[:, 1:] if plant.B.shape[1] > 1 else plant.B
+    counted = plant.C[p:] if len(plant.C) > p else plant.C[[cascade.position]]
+    return strictly_proper(plant.A, plant.B[:, :1], plant.C[:p]), drive, counted
+
+
 class CascadeRows:
     """Rows of a cascade on some plants.
 
@@ -105,7 +149,7 @@ class CascadeRows:
     ----------
     cascade, bounds, sampling : Cascade, Bounds, Sampling
     plants : sequence of StateSpace
-        SI, continuous.
+        SI, continuous; with their ports where z/d is bounded.
     options : SearchOptions
     """
 
@@ -115,7 +159,8 @@ class CascadeRows:
     ) -> None:  # fmt: skip
         self.cascade, self.bounds, self.options = cascade, bounds, options
         T = sampling.period
-        self.systems = [sampled(plant, T, sampling.delay) for plant in plants]
+        self.sampling, self.plants = sampling, [split(plant, cascade) for plant in plants]
+        self.systems = [sampled(plant, T, sampling.delay) for plant, *_ in self.plants]
         rates = np.concatenate([np.abs(plant.rates) for plant in plants])
         near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
         about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
@@ -133,12 +178,29 @@ class CascadeRows:
         hertz = cascade.hertz
         ranges[1, hertz] = np.minimum(ranges[1, hertz], options.highest / T)
         self.low, self.high = np.log(ranges)
-        self.mass = self._mass(plants[0])
+        self.mass = self._mass(self.plants[0][0])
 
     def on(self, omega: Array) -> None:
         """Take another grid of frequencies."""
         self.omega, self.z = omega, np.exp(1j * omega * self.period)
-        self.G = [system.swept(omega)[:, :, 0].T for system in self.systems]
+        self.seen = self._responses(omega)
+
+    def _responses(self, omega: Array) -> list[Responses]:
+        """Every plant at these frequencies."""
+        found = []
+        for system, (plant, drive, counted) in zip(self.systems, self.plants, strict=True):
+            G = system.swept(omega)[:, :, 0].T
+            most = self.bounds.compliance_max
+            if most is None:
+                found.append(Responses(G))
+                continue
+            C = np.vstack([plant.C, counted])
+            d = strictly_proper(plant.A, drive, C).swept(omega)[:, :, 0].T
+            late = strictly_proper(plant.A, plant.B, counted)
+            u = sampled(late, self.period, self.sampling.delay).swept(omega)[:, 0, 0]
+            limit = np.where(omega <= self.cascade.stiff_below, most, np.inf)
+            found.append(Responses(G, (d[-1], u * d[:-1], limit)))
+        return found
 
     def _mass(self, plant: StateSpace) -> float:
         """kg that the force moves as seen by the position's sensor, by G at ω_low."""
@@ -175,24 +237,18 @@ class CascadeRows:
             by_x = 1.0 + np.where(above & b.opens, 2.0 * (b.shape - 1.0) / x**2 / room, 0.0)
         else:
             shape, by_x = np.where(above, np.inf, -0.5 * np.log(2.0)), 0.0 * x
-        own = {c.name: c.S_max or b.S_max for c in b.channels}
         values, slopes = [], []
-        for G in self.G:
-            L, dL = G * K, G * dK
-            D, dD = 1.0 + L.sum(axis=0), dL.sum(axis=1)
-            for place in self._places():
-                rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
-                N, dN = 1.0 + L[rest].sum(axis=0), dL[:, rest].sum(axis=1)
-                S, dS = np.log(np.abs(N / D)), (dN / N - dD / D).real.T
-                name = "actuator" if place is None else self._name(place)
-                values.append(S - np.log(own.get(name, b.S_max)))
-                slopes.append(np.column_stack([dS, 0.0 * x]))
+        for one in self.seen:
+            for place, size, limit, steep in self._figures(one, K, dK):
+                S = np.log(size)
+                values.append(S - np.log(limit))
+                slopes.append(np.column_stack([steep, 0.0 * x]))
                 if place == self.cascade.position:
                     values.append(S - shape)
-                    slopes.append(np.column_stack([dS, by_x]))
+                    slopes.append(np.column_stack([steep, by_x]))
                     at = int(np.searchsorted(w, b.omega_low))
                     values.append(S[at : at + 1] - np.log(b.S_low))
-                    slopes.append(np.append(dS[at], 0.0)[None])
+                    slopes.append(np.append(steep[at], 0.0)[None])
         if self.cascade.drive.number is Number.FIXED_30:
             for value, slope in self._coefficients(kappa):
                 values.append(value)
@@ -257,13 +313,13 @@ class CascadeRows:
         ))  # fmt: skip
         K = self.cascade.responses(values, np.exp(1j * fine * T))[0]
         new: list[float] = []
-        for system in self.systems:
-            L = system.swept(fine)[:, :, 0].T * K
-            for _, S, limit in self._figures(L):
-                cells = S[:-1].reshape(-1, o.finer)
-                ends = np.maximum(S[: -o.finer : o.finer], S[o.finer :: o.finer])
+        for one in self._responses(fine):
+            for _, S, limit, _ in self._figures(one, K):
+                share = S / limit
+                cells = share[:-1].reshape(-1, o.finer)
+                ends = np.maximum(share[: -o.finer : o.finer], share[o.finer :: o.finer])
                 top = cells.max(axis=1)
-                high = (top > ends * (1.0 + o.missed)) & (top > limit * (1.0 - o.alert))
+                high = (top > ends * (1.0 + o.missed)) & (top > 1.0 - o.alert)
                 at = cells.argmax(axis=1) + o.finer * np.arange(len(cells))
                 new += fine[at[high]].tolist()
         if not new:
@@ -278,9 +334,9 @@ class CascadeRows:
         bandwidth = float(self.cascade.allowed(values).min())
         rise = self.cascade.rises(values, self.z)[0].max()
         worst = float(rise - np.log(self.cascade.filter_gain))
-        for G in self.G:
-            for place, S, limit in self._figures(G * K):
-                worst = max(worst, float(np.log(S.max() / limit)))
+        for one in self.seen:
+            for place, S, limit, _ in self._figures(one, K):
+                worst = max(worst, float(np.log((S / limit).max())))
                 if place == self.cascade.position:
                     bandwidth = min(bandwidth, self._band(S))
                     low = S[np.searchsorted(self.omega, b.omega_low)]
@@ -295,14 +351,22 @@ class CascadeRows:
         over = np.flatnonzero(2.0 * S**2 > 1.0)
         return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
 
-    def _figures(self, L: np.ndarray) -> list[tuple[int | None, Array, float]]:
-        """|S| at every place by its loops L (p, k), and its bound."""
-        D, b = np.abs(1.0 + L.sum(axis=0)), self.bounds
+    def _figures(self, one: Responses, K: np.ndarray, dK: np.ndarray | None = None) -> list[Figure]:
+        """|S| at every place, and |z/d|; with slopes where those of K are given."""
+        dK = np.zeros((0, *K.shape)) if dK is None else dK
+        L, dL, b = one.G * K, one.G * dK, self.bounds
+        D, dD = 1.0 + L.sum(axis=0), dL.sum(axis=1)
         own = {c.name: c.S_max or b.S_max for c in b.channels}
-        found = []
+        found: list[tuple[int | str | None, np.ndarray, np.ndarray, float | Array]] = []
         for place in self._places():
             rest = np.zeros(len(L), bool) if place is None else np.arange(len(L)) != place
             name = "actuator" if place is None else self._name(place)
-            S = np.abs(1.0 + L[rest].sum(axis=0)) / D
-            found.append((place, S, float(own.get(name, b.S_max))))
-        return found
+            N, dN = 1.0 + L[rest].sum(axis=0), dL[:, rest].sum(axis=1)
+            found.append((place, N, dN, own.get(name, b.S_max)))
+        if one.forces is not None:
+            free, through, limit = one.forces
+            N = free * D - (K * through).sum(axis=0)
+            dN = free * dD - (dK * through).sum(axis=1)
+            found.append((FORCE, N, dN, limit))
+        return [Figure(place, np.abs(N / D), limit, (dN / N - dD / D).real.T)
+                for place, N, dN, limit in found]  # fmt: skip

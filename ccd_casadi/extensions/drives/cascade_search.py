@@ -50,7 +50,7 @@ class Search(CascadeRows):
         for _ in range(o.retreats):
             if self.stable(np.exp(kappa)):
                 return np.exp(kappa)
-            kappa[:2] -= 0.3, 0.5
+            kappa[:3] += -0.3, -0.5, 0.3
         return None
 
     def climb(

@@ -14,7 +14,7 @@ from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
 from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.problem import CoDesignProblem, refuse_ports
+from ccd_casadi.inner_problem.problem import CoDesignProblem, refuse_ports, with_ports
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
@@ -24,13 +24,15 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class DriveProblem:
-    """A cascade, its plants at one θ of a co-design problem, and what its loops have to keep."""
+    """A cascade, its plants at one θ of a co-design problem, and what its loops have to keep;
+    `ported`: the plants with their ports, where compliance_max bounds what a force moves."""
 
     problem: CoDesignProblem
     cascade: Cascade
     uncertain: UncertainPlant
     bounds: Bounds
     sampling: Sampling
+    ported: UncertainPlant | None = None
 
 
 def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProblem:
@@ -59,14 +61,16 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         if drive.loop != "cascade":
             words = f"{drive.title} has no cascade; its PID is not designed yet"
             raise UserError(f"{words}: use `ccd tune`, or another drive")
-        problem = problem_of(replace(case, drive=DriveTable()))
+        most = case.inner.compliance_max
+        inner = replace(case.inner, compliance_max=None)  # of the table's force, not the sensors'
+        problem = problem_of(replace(case, drive=DriveTable(), inner=inner))
         if not isinstance(problem.controller, StructuredProblem):
             raise UserError('controller.structure is not "sections"; a drive needs that')
         if problem.sampling is None:
             raise UserError("loop.rate_hz is missing; a drive is sampled, give its rate")
-        refuse_ports(problem, "[drive]")
-        bounds = bounds_of(problem)
-        require_known(bounds)
+        if most is None:
+            refuse_ports(problem, "[drive] without inner.compliance_max")
+        bounds = replace(bounds_of(problem), compliance_max=most)
         filters: list[Slot] = []
         for place, count in (("current", table.filters), ("setpoint", table.setpoint_filters)):
             there = drive.places(place)
@@ -77,13 +81,22 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         position, velocity, count = _sensors(bounds, table.velocity)
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
                           table.filter_gain, table.filters_above, table.decay,
-                          _slower(table, problem.sampling, bounds.omega_low))  # fmt: skip
-        uncertain = uncertain_plant(problem, problem.start if theta is None else theta)
+                          _slower(table, problem.sampling, bounds.omega_low),
+                          HZ * (table.compliance_hz or np.inf))  # fmt: skip
+        require_known(cascade, bounds)
+        at = problem.start if theta is None else theta
+        uncertain, ported = uncertain_plant(problem, at), None
+        if most is not None:
+            ported = uncertain_plant(with_ports(problem), at)
+            wide = ported.options[0]
+            if wide.B.shape[1] > 2 or len(wide.C) > count + 1:
+                words = "disturbance and performance are several"
+                raise UserError(f"{words}; [drive] bounds what one force moves: return one of each")
     except CaseError:
         raise
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
-    return DriveProblem(problem, cascade, uncertain, bounds, problem.sampling)
+    return DriveProblem(problem, cascade, uncertain, bounds, problem.sampling, ported)
 
 
 def _slower(table: DriveTable, sampling: Sampling, omega_low: float) -> int:

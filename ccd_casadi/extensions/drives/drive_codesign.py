@@ -24,7 +24,7 @@ from ccd_casadi.extensions.drives.drive_design import (
     first_points,
     plants_at,
 )
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, with_ports
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
@@ -173,7 +173,8 @@ def _designed(
 ) -> DriveAt | None:  # fmt: skip
     """The cascade at a θ, from that at another one; None where none meets the bounds."""
     problem, own = drive.problem, options.drive.search
-    uncertain = uncertain_plant(problem, theta)
+    of = problem if drive.ported is None else with_ports(problem)
+    uncertain = uncertain_plant(of, theta)
     plants = plants_at(uncertain, first_points(uncertain))
     search = Search(drive.cascade, drive.bounds, drive.sampling, plants, own)
     if near is None:

@@ -37,6 +37,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         drive_page,
         entry,
         figures_of,
+        move_errors,
         named_theta,
         proof_words,
         sheet_text,
@@ -55,7 +56,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     if theta is not None and options.codesign:
         raise UserError("--theta fixes what --codesign searches; give one of both")
     problem = drive_problem(case, theta)
-    known = [(one.number, one.name) for one in problem.cascade.settings]
+    drive = problem.cascade.drive
+    own_settings = *problem.cascade.settings, drive.speed_feedforward, drive.force_feedforward
+    known = [(one.number, one.name) for one in own_settings if one]
     if strange := [name for name in today or {} if not any(name in pair for pair in known)]:
         own = ", ".join(number or name for number, name in known)
         raise UserError(f"{options.today}: {strange[0]} is no parameter of this drive: {own}")
@@ -75,14 +78,15 @@ def main(options: argparse.Namespace) -> ExitCode:
         found = design_drive(
             problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
             seed=options.seed, workers=workers, options=numbers, near=near,
-            progress=lambda words: remark(words, options.quiet),
+            progress=lambda words: remark(words, options.quiet), ported=problem.ported,
         )  # fmt: skip
-    text = sheet_text(found, today)
+    moved = move_errors(problem, found)
+    text = sheet_text(found, today, moved)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
-    code = program_of(found.cascade, found.values).code(run_name(folder))
+    code = program_of(found.cascade, found.values, found.ahead).code(run_name(folder))
     (folder / "cascade.c").write_text(code, "utf-8")
-    answer = entry(found, today) | searched | {"seconds": options.seconds(), "seed": options.seed,
-                             "versions": versions()}  # fmt: skip
+    run = {"seconds": options.seconds(), "seed": options.seed, "versions": versions()}
+    answer = entry(found, today, moved) | searched | run
     write_json(folder / "drive.json", answer)
     write_page(folder / "report.html", drive_page(run_name(folder), problem, found, today))
     if searched:

@@ -1,24 +1,26 @@
 """A drive's cascade on a set of plants: searched, rounded, judged and proven."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
+from ccd_casadi.extensions.drives.cascade_rows import SearchOptions, split
 from ccd_casadi.extensions.drives.cascade_search import (
     Candidate,
     RoundingOptions,
     Search,
     on_the_grid,
 )
+from ccd_casadi.extensions.drives.drive_data import Setting
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.two_rates import judge_two_rates
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -41,7 +43,9 @@ class DriveOptions:
     draws : int
         Plants that are drawn for the judge besides the corners.
     draws_unproven : int
-        The same of two rates, of which there is no proof.
+        The same of two rates and of what varies or moves by a force, of which there is no proof.
+    added : int
+        Of these the worst that a round adds to the search's plants, at most.
     rounds : int
         Of search and proof: a plant that the proof finds is added.
     rise_points : int
@@ -54,6 +58,7 @@ class DriveOptions:
     draws: int = 24
     rounds: int = 3
     draws_unproven: int = 200
+    added: int = 4
     lowered: int = 10
     lower: float = 1e-3
     rise_points: int = 20_000
@@ -78,6 +83,10 @@ class DriveDesign:
         Of the rounded controller, on corners, draws and what the proof found.
     proof : Proof or None
         Of the rounded controller; None of two rates.
+    compliance : float or None
+        The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
+    mass : float
+        kg that the force moves as a rigid body, at the position's sensor; 0: none.
     """
 
     cascade: Cascade
@@ -86,14 +95,37 @@ class DriveDesign:
     free: Candidate
     certificate: SetCertificate
     proof: Proof | None
+    compliance: float | None = None
+    mass: float = 0.0
+
+    @property
+    def feedforward(self) -> list[tuple[Setting, float]]:
+        """What the drive has of it, with values on its grid: all of the velocity, and the mass."""
+        drive = self.cascade.drive
+        both = (drive.speed_feedforward, 1.0), (drive.force_feedforward, self.mass)
+        return [(own, own.rounded(value)) for own, value in both if own and self.mass]
+
+    @property
+    def ahead(self) -> tuple[float, float]:
+        """f and m of the program."""
+        known, drive = dict(self.feedforward), self.cascade.drive
+        f, m = (known.get(own, 0.0) if own else 0.0
+                for own in (drive.speed_feedforward, drive.force_feedforward))  # fmt: skip
+        return f, m
 
     @property
     def status(self) -> str:
         """verified: the judge passes it, and it is proven on the whole set, or judged on all of it
         where the set is one plant."""
-        proven = len(self.certificate.plants) == 1 if self.proof is None else self.proof.proven
+        proven = self.one_plant if self.proof is None else self.proof.proven
+        proven &= self.one_plant or self.compliance is None
         whole = self.certificate.passed and proven and self.rise <= self.cascade.filter_gain
         return "verified" if whole else "not_verified"
+
+    @property
+    def one_plant(self) -> bool:
+        """Whether the set is one plant, of which nothing has to be proven."""
+        return len(self.certificate.plants) == 1
 
     @property
     def rise(self) -> float:
@@ -111,6 +143,7 @@ def design_drive(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, *,
     seed: int = 0, workers: Pool | None = None, progress: Tell = silent,
     options: DriveOptions = DriveOptions(), near: Candidate | None = None,
+    ported: UncertainPlant | None = None,
 ) -> DriveDesign:  # fmt: skip
     """Find the fastest rounded cascade.
 
@@ -125,6 +158,8 @@ def design_drive(
     options : DriveOptions
     near : Candidate, optional
         From which the search climbs, instead of many starts.
+    ported : UncertainPlant, optional
+        The same with its ports, where compliance_max bounds what a force moves.
 
     Returns
     -------
@@ -135,36 +170,51 @@ def design_drive(
     UserError
         No start is stable within the drive's limits, or none meets the bounds.
     """
-    require_known(bounds)
+    require_known(cascade, bounds)
     if cascade.slower > 1:
         return _design_two_rates(cascade, uncertain, bounds, sampling, seed, progress, options,
                                  near)  # fmt: skip
-    points = first_points(uncertain)
-    progress(f"searching {options.search.starts} starts on {counted(len(points), 'plant')}")
-    search = Search(cascade, bounds, sampling, plants_at(uncertain, points), options.search)
-    free = search.fastest(seed, progress) if near is None else search.settled(near)
-    if free is None:
-        raise UserError(NO_CASCADE)
+    of_S, wide = replace(bounds, compliance_max=None), ported or uncertain
+    points: list[tuple[int, Array]] = []
+    new, unproven = first_points(uncertain), bool(uncertain.ranges) or wide is ported
+    draws = options.draws_unproven if unproven else options.draws
+    progress(f"searching {options.search.starts} starts on {counted(len(new), 'plant')}")
+    free = near
     for number in range(1, options.rounds + 1):
+        points = [*points, *new]
+        search = Search(cascade, bounds, sampling, plants_at(wide, points), options.search)
+        free = search.fastest(seed, progress) if free is None else search.settled(free)
+        if free is None:
+            raise UserError(NO_CASCADE)
         progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
         rounded = on_the_grid(search, free, options.rounding)
-        judged = judge(cascade, rounded.values, uncertain, bounds, sampling, points, seed, workers,
-                       options.draws)  # fmt: skip
+        tried = [*points, *uncertain.drawn(np.random.default_rng([seed, draws]), draws)]
+        judged = judge(cascade, rounded.values, uncertain, of_S, sampling, tried, workers)
+        moved = None if ported is None else moved_by_forces(
+            cascade, rounded.values, ported.as_written(tried), sampling,
+            options.search.lowest * bounds.omega_low)  # fmt: skip
+        if moved is not None and bounds.compliance_max is not None:
+            judged = with_compliance(judged, moved, bounds.compliance_max)
         band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
         progress(f"{band / HZ:.4g} Hz on the drive's grid; proving it on the whole set")
-        proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
+        proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
         for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
             if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):
                 break
             band *= 1.0 - options.lower
-            proof = prove_cascade(cascade, rounded.values, band, uncertain, bounds, sampling)
-        if not proof.refuted:
+            proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
+        new = [(proof.option, np.array(proof.point))] if proof.refuted else []
+        if unproven:
+            over = excesses(judged, bounds, rounded.bandwidth)
+            worst = np.argsort(-over)[: options.added]
+            new += [tried[i] for i in worst if over[i] > options.lower and i >= len(points)]
+        if not new:
             break
-        points = [*points, (proof.option, np.array(proof.point))]
-        search = Search(cascade, bounds, sampling, plants_at(uncertain, points), options.search)
-        free = search.settled(free)
+    assert free is not None
     cascade.require_fit(rounded.values)
-    return DriveDesign(cascade, rounded.values, band, free, judged, proof)
+    most = None if moved is None else float(moved.max())
+    return DriveDesign(cascade, rounded.values, band, free, judged, proof, most,
+                       rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 
 def _design_two_rates(
@@ -197,7 +247,8 @@ def _design_two_rates(
     assert free is not None
     cascade.require_fit(rounded.values)
     band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
-    return DriveDesign(cascade, rounded.values, band, free, judged, None)
+    return DriveDesign(cascade, rounded.values, band, free, judged, None,
+                       mass=rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 
 def _tighter(bounds: Bounds, peak: float, low: float) -> Bounds:
@@ -213,20 +264,66 @@ def _tighter(bounds: Bounds, peak: float, low: float) -> Bounds:
 
 def judge(
     cascade: Cascade, values: Array, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling,
-    points: list[tuple[int, Array]], seed: int = 0, workers: Pool | None = None, draws: int = 24,
+    points: list[tuple[int, Array]], workers: Pool | None = None,
 ) -> SetCertificate:  # fmt: skip
-    """Certify values on the plants of points and draws, by the matrices as they are written."""
-    drawn = uncertain.drawn(np.random.default_rng([seed, draws]), draws)
-    plants = uncertain.as_written([*points, *drawn])
-    K = cascade.state_space(values)
+    """Certify values on plants, by the matrices as they are written."""
+    plants, K = uncertain.as_written(points), cascade.state_space(values)
     return certify(plants, K, bounds, sampling, integrator=True, workers=workers)
 
 
-def require_known(bounds: Bounds) -> None:
+def moved_by_forces(
+    cascade: Cascade, values: Array, plants: Sequence[StateSpace], sampling: Sampling, lowest: float
+) -> Array:
+    """The largest |z/d| of every plant with its ports, m/N, from `lowest` (rad/s; below it the
+    integrator lets it fall, and free bodies cost it its digits) to `stiff_below`; inf: unstable."""
+    found, K = [], cascade.state_space(values)
+    for plant in plants:
+        sensed, drive, counted = split(plant, cascade)
+        loop = Loop(sensed, K, sampling, drive=drive, counted=counted)
+        omega = loop.grid() if loop.stable else np.zeros(0)
+        omega = np.append(omega, min(cascade.stiff_below, np.pi / sampling.period * 0.999))
+        omega = omega[(omega >= lowest) & (omega <= cascade.stiff_below)]
+        found.append(float(np.abs(loop.moved(omega)).max()) if loop.stable else np.inf)
+    return np.array(found)
+
+
+def with_compliance(judged: SetCertificate, moved: Array, most: float) -> SetCertificate:
+    """A certificate with what forces move in the place of GS, over its bound."""
+    plants = tuple(replace(one, GS=m) for one, m in zip(judged.plants, moved.tolist(), strict=True))
+    share, words = float(moved.max() / most), judged.words
+    over = share > 1.0 + JudgeOptions().tolerance
+    if over:
+        words = f"exceeds compliance_max by {100.0 * (share - 1.0):.2g} %; of |S|: {words}"
+    return replace(judged, passed=judged.passed and not over, words=words, plants=plants,
+                   worst=judged.worst | {"GS": share})  # fmt: skip
+
+
+def excesses(judged: SetCertificate, bounds: Bounds, bandwidth: float) -> Array:
+    """By which share every plant exceeds its worst bound, or falls short of the bandwidth."""
+    found = np.full(len(judged.plants), np.inf)
+    for i, one in enumerate(judged.plants):
+        if one.stable:
+            shares = bounds.shares(one) | bounds.channel_shares(one.channels)
+            found[i] = max(*shares.values(), bandwidth / one.bandwidth) - 1.0
+    return found
+
+
+def require_known(cascade: Cascade, bounds: Bounds) -> None:
     """Raise UserError for bounds that a drive's design has no rows of."""
-    for key in ("weighted_level", "compliance_max"):
-        if getattr(bounds, key) is not None:
-            raise UserError(f"{key} does not go with [drive] yet; leave it out")
+    if bounds.weighted_level is not None:
+        raise UserError("weighted_level does not go with [drive]; leave it out")
+    if bounds.compliance_max is not None and cascade.slower > 1:
+        words = "compliance_max does not go with a slower position loop"
+        raise UserError(f"{words}; leave out that or position_rate_hz")
+
+
+def rigid_mass(uncertain: UncertainPlant, position: int) -> float:
+    """kg that the model's force moves as rigid bodies at the position's sensor; 0: none."""
+    modal = uncertain.modal(0)
+    if modal.states is not None:
+        return 0.0
+    per_force = float(modal.C[position, modal.rigid] @ modal.B[modal.rigid, 0])
+    return 1.0 / per_force if per_force > 0.0 else 0.0
 
 
 def first_points(uncertain: UncertainPlant) -> list[tuple[int, Array]]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.extensions.drives.arithmetic import ArithmeticOptions, following_error, program_of
 from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
@@ -23,7 +24,8 @@ Today = Mapping[str, float]  # values by number or name
 def sheet_rows(design: DriveDesign, today: Today | None = None) -> list[dict[str, Any]]:
     """One entry for each parameter, in the drive's unit; `today`'s values by number or name."""
     rows, given = [], today or {}
-    for setting, value in zip(design.cascade.settings, design.values.tolist(), strict=True):
+    own = zip(design.cascade.settings, design.values.tolist(), strict=True)
+    for setting, value in [*own, *design.feedforward]:
         shown = setting.shown(round(value * setting.per_si / setting.step))
         old = given.get(setting.name, given.get(setting.number))
         rows.append({"number": setting.number, "name": setting.name, "value": shown,
@@ -31,8 +33,22 @@ def sheet_rows(design: DriveDesign, today: Today | None = None) -> list[dict[str
     return rows
 
 
-def entry(design: DriveDesign, today: Today | None = None) -> dict[str, Any]:
-    """Everything that is known, as JSON holds it."""
+def move_errors(drive: DriveProblem, design: DriveDesign) -> tuple[float, float] | None:
+    """m that the model's position is behind its setpoint at most, in a simulated move with and
+    without feedforward; None of a drive that has none."""
+    if not design.feedforward:
+        return None
+    plant = drive.uncertain.plant(drive.uncertain.nominal).plant_si()
+    G, own = sampled(plant, drive.sampling.period, drive.sampling.delay), design.cascade
+    first, second = (program_of(own, design.values, ahead) for ahead in (design.ahead, (0.0, 0.0)))
+    return (following_error(first, G, own.position, own.velocity),
+            following_error(second, G, own.position, own.velocity))  # fmt: skip
+
+
+def entry(
+    design: DriveDesign, today: Today | None = None, moved: tuple[float, float] | None = None
+) -> dict[str, Any]:
+    """Everything that is known, as JSON holds it; `moved` by `move_errors`."""
     drive, judged, bounds = design.cascade.drive, design.certificate, design.certificate.worst
     return {
         "status": design.status,
@@ -41,6 +57,7 @@ def entry(design: DriveDesign, today: Today | None = None) -> dict[str, Any]:
         "bandwidth_hz": design.bandwidth / HZ,
         "free_bandwidth_hz": design.free.bandwidth / HZ,
         "filter_gain": design.rise,
+        "compliance": design.compliance,
         "judge": {"passed": judged.passed, "words": judged.words, "plants": len(judged.plants),
                   "shares": bounds},
         "position_rate_hz": 1.0 / (design.cascade.period * design.cascade.slower),
@@ -48,6 +65,7 @@ def entry(design: DriveDesign, today: Today | None = None) -> dict[str, Any]:
             "proven": design.proof.proven, "words": design.proof.words,
             "levels": design.proof.levels, "slack": design.proof.slack},
         "parameters": sheet_rows(design, today),
+        "following_error": None if moved is None else {"m": moved[0], "without_m": moved[1]},
         "sources": list(drive.sources),
         "chosen": list(drive.chosen),
         "unknown": list(drive.unknown),
@@ -78,14 +96,17 @@ def codesign_words(entry: Mapping[str, Any]) -> str:
 def proof_words(design: DriveDesign) -> str:
     """What is proven, in a sentence."""
     if design.proof is not None:
-        return design.proof.words
+        left = "" if design.compliance is None else "; compliance is judged, not proven"
+        return f"{design.proof.words}{left}"
     if len(design.certificate.plants) == 1:
         return "not needed: the set is one plant"
     return "there is none of two rates; between the judged plants nothing is proven"
 
 
-def sheet_text(design: DriveDesign, today: Today | None = None) -> str:
-    """The sheet as text, `today`'s values beside the new ones."""
+def sheet_text(
+    design: DriveDesign, today: Today | None = None, moved: tuple[float, float] | None = None
+) -> str:
+    """The sheet as text, `today`'s values beside the new ones; `moved` by `move_errors`."""
     head = ["number", "parameter", "new", "unit"] if today is None else [
         "number", "parameter", "today", "new", "unit"]  # fmt: skip
     lines = [head]
@@ -103,12 +124,21 @@ def sheet_text(design: DriveDesign, today: Today | None = None) -> str:
     found.append(f"judged        {design.certificate.words}")
     found.append(f"proof         {proof_words(design)}")
     own, (Kv, _, Tn) = design.cascade, design.values[:3]
+    if design.compliance is not None:
+        until = "" if np.isinf(own.stiff_below) else f" up to {own.stiff_below / HZ:.4g} Hz"
+        found.append(f"compliance    at most {design.compliance:.4g} m/N{until} on the judged "
+                     "plants")  # fmt: skip
     lowest = design.values[own.hertz].min(initial=np.inf) / rounded
     found.append(f"filters       raise their gain to {design.rise:.4g} of rest, limit "
                  f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, limit "
                  f"{own.filters_above:.4g}")  # fmt: skip
     found.append(f"decay         ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
                  f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}")  # fmt: skip
+    if moved is not None:
+        o = ArithmeticOptions()
+        found.append(f"move          {1e3 * o.distance:g} mm in {o.seconds:g} s: off by "
+                     f"{1e6 * moved[0]:.4g} µm at most, {1e6 * moved[1]:.4g} µm without "
+                     "feedforward")  # fmt: skip
     found += [f"chosen        {words}" for words in drive.chosen]
     found += [f"not known     {words}" for words in drive.unknown]
     return "\n".join(found)
@@ -140,7 +170,8 @@ def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture
     names = [channel.name for channel in drive.bounds.channels] or ["the position", "the motor"]
     period, late = 1e6 * own.period, 1e6 * drive.sampling.delay
     often = f"every {number(own.slower * period)} µs"
-    blocks = [_block("position", often, rows[:1], "", "left")]
+    ahead, at_speed = rows[len(own.settings) :], own.drive.speed_feedforward is not None
+    blocks = [_block("position", often, [*rows[:1], *ahead[:at_speed]], "", "left")]
     current: list[dict[str, Any]] = []
     at = 3
     for slot in own.slots:
@@ -148,7 +179,8 @@ def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture
         at += len(part)
         block = _block(slot.name, "", part, f"{slot.name}, ")
         (current if slot.place == "current" else blocks).append(block)
-    blocks.append(_block("velocity", f"every {number(period)} µs", rows[1:3], "", "right"))
+    blocks.append(_block("velocity", f"every {number(period)} µs", [*rows[1:3], *ahead[at_speed:]],
+                         "", "right"))  # fmt: skip
     blocks += [*current, _block("current loop", f"part of the delay, {number(late)} µs", [], "")]
     blocks.append(_block("machine", "", [], ""))
     y = 18
