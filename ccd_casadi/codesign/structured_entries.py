@@ -74,7 +74,7 @@ def design_dict(
         "outcome": design.outcome.name.lower(),
         "reason": "" if design.certified else design.words,
         "bandwidth_hz": design.bandwidth / HZ,
-        **dict.fromkeys(("gamma_opt", "gamma", "gamma_lower_bound")),
+        **dict.fromkeys(("gamma_opt", "gamma", "gamma_lower_bound", "optimum")),
         "sensitivity_peak": highest.S_peak,
         "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
         "sensitivity_low": max(plant.S_low for plant in judged.plants),
