@@ -407,7 +407,7 @@ def test_every_place_shows_the_same_lines() -> None:
         assert f"{name} words" in page
         assert f"{name} rests on it" in terminal
         assert f"{name} rests on it" in page
-    assert decision.worst_state(result) is v.State.WARNED
+    assert concerns.worst_state(result) is v.State.WARNED
     assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)
@@ -420,8 +420,8 @@ def test_every_place_shows_the_same_lines() -> None:
 
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
-    assert decision.lines_of(damage) == ()
-    assert block_html(Verdict(decision.lines_of(damage))) == ""
+    assert concerns.lines_of(damage) == ()
+    assert block_html(Verdict(concerns.lines_of(damage))) == ""
 
 
 def test_the_words_of_a_set_name_its_evidence_beside_the_levels_that_a_proof_left() -> None:
