@@ -29,8 +29,7 @@ from ccd_casadi.inner_problem.problem import (
     require_as_returned,
 )
 from ccd_casadi.inner_problem.searched_problem import state_of
-from ccd_casadi.lti.between_samples import BetweenOptions, BetweenSamples, peak_between
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -139,21 +138,18 @@ def second_on_set(
 
 
 def between_on_set(
-    problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign",
-    options: BetweenOptions = BetweenOptions(),
-) -> BetweenSamples | None:  # fmt: skip
-    """S between the samples of a design's loops, on the plants of its certificate with the largest
-    peaks at the instants; None of a continuous loop, and where a plant is known at these alone."""
+    problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign"
+) -> BetweenSamples | None:
+    """S between the samples of a design's loops, on the plants of its certificate; None of a
+    continuous loop, and where a plant is known at the instants alone."""
     judged, K, sampling = design.certificate, design.controller, problem.sampling
     if judged is None or K is None or sampling is None:
         return None
-    plants = plants_of_set(problem, theta)
-    if plants[0].period or not all(figures.stable for figures in judged.plants):
+    if not all(figures.stable for figures in judged.plants):
         return None
-    first = np.argsort([-figures.S_peak for figures in judged.plants])[: options.plants]
+    peaks = [figures.S_peak for figures in judged.plants]
     places = kind_of(problem).bounds().places
-    loops = [Loop(plants[i], K, sampling, at=places) for i in first]
-    return max((peak_between(loop, options) for loop in loops), key=lambda one: one.peak)
+    return worst_between(plants_of_set(problem, theta), peaks, K, sampling, places)
 
 
 KEPT = {

@@ -49,8 +49,8 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.lti.between_samples import BetweenOptions, peak_between
-from ccd_casadi.lti.loop import Loop, Sampling, sampled
+from ccd_casadi.lti.between_samples import worst_between
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -391,12 +391,15 @@ def _assessed(
         members=tuple(MemberLoop(at, item) for at, item in figures.items()),
         unverified=unverified, statics=at_rest, compliance_max=most, **way,
     )  # fmt: skip
-    if found.stable and not run.plant.plant_si().period:
-        sampling, most_plants = Sampling(rate_hz, 1e6 * delay), BetweenOptions.plants
-        first = sorted(figures, key=lambda at: -figures[at].sensitivity_peak)[:most_plants]
-        loops = [Loop(plants[at], K, sampling, at=places) for at in (nominal, *first)]
-        peaks = [peak_between(loop) for loop in loops]
-        found = replace(found, between=max(peaks, key=lambda one: one.peak))
+    if found.stable:
+        peaks = [
+            found.sampled.sensitivity_peak,
+            *(one.sensitivity_peak for one in figures.values()),
+        ]
+        sampling = Sampling(rate_hz, 1e6 * delay)
+        found = replace(
+            found, between=worst_between([*plants.values()], peaks, K, sampling, places)
+        )
     if fixed is not None and found.stable:
         bounds = [rounding_bound(G, K, fixed) for G in held.values()]
         found = replace(found, rounding=max(bounds, key=lambda one: one.largest))

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.lti.frequency_grid import local_maxima, zoomed
-from ccd_casadi.lti.loop import Loop, delay_parts, sampled
+from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, sampled
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, sensitivity, sigma_max
 from ccd_casadi.support.arrays import Array
@@ -186,3 +186,35 @@ def peak_between(loop: Loop, options: BetweenOptions = BetweenOptions()) -> Betw
     instants = float(gains(np.append(omega, grid))[0].max())
     step = int(np.argmax(each))
     return BetweenSamples(float(each[step]), instants, float(top), step / options.times)
+
+
+def worst_between(
+    plants: Sequence[StateSpace], peaks: Sequence[float], controller: StateSpace,
+    sampling: Sampling, places: tuple[BreakPoint, ...] = (),
+    options: BetweenOptions = BetweenOptions(),
+) -> BetweenSamples | None:  # fmt: skip
+    """Find the largest σ_max(S_τ) on those of a set's plants that are worst at the instants.
+
+    Parameters
+    ----------
+    plants : sequence of StateSpace
+        Continuous, SI; each loop is stable.
+    peaks : sequence of float
+        ‖S‖∞ at the instants, of each.
+    controller : StateSpace
+        K in SI; one in discrete time runs as it is.
+    sampling : Sampling
+    places : tuple of BreakPoint
+        Of several sensors on one actuator: first where the error counts.
+    options : BetweenOptions
+
+    Returns
+    -------
+    BetweenSamples or None
+        None of plants that are known at the instants alone.
+    """
+    if plants[0].period:
+        return None
+    first = np.argsort(-np.array(peaks))[: options.plants]
+    loops = [Loop(plants[i], controller, sampling, at=places) for i in first]
+    return max((peak_between(loop, options) for loop in loops), key=lambda one: one.peak)

@@ -20,6 +20,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -87,6 +88,8 @@ class DriveDesign:
         The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
     mass : float
         kg that the force moves as a rigid body, at the position's sensor; 0: none.
+    between : BetweenSamples or None
+        S between the samples, where the position counts; None of two rates.
     """
 
     cascade: Cascade
@@ -97,6 +100,7 @@ class DriveDesign:
     proof: Proof | None
     compliance: float | None = None
     mass: float = 0.0
+    between: BetweenSamples | None = None
 
     @property
     def feedforward(self) -> list[tuple[Setting, float]]:
@@ -212,9 +216,12 @@ def design_drive(
             break
     assert free is not None
     cascade.require_fit(rounded.values)
-    most = None if moved is None else float(moved.max())
+    most, between = None if moved is None else float(moved.max()), None
+    if all(one.stable for one in judged.plants):
+        K, peaks = cascade.state_space(rounded.values), [one.S_peak for one in judged.plants]
+        between = worst_between(uncertain.as_written(tried), peaks, K, sampling, bounds.places)
     return DriveDesign(cascade, rounded.values, band, free, judged, proof, most,
-                       rigid_mass(uncertain, cascade.position))  # fmt: skip
+                       rigid_mass(uncertain, cascade.position), between)  # fmt: skip
 
 
 def _design_two_rates(

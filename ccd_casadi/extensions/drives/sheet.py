@@ -65,6 +65,7 @@ def entry(
             "proven": design.proof.proven, "words": design.proof.words,
             "levels": design.proof.levels, "slack": design.proof.slack},
         "parameters": sheet_rows(design, today),
+        "between_samples": None if design.between is None else design.between.entry,
         "following_error": None if moved is None else {"m": moved[0], "without_m": moved[1]},
         "sources": list(drive.sources),
         "chosen": list(drive.chosen),
