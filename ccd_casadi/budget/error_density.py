@@ -239,7 +239,7 @@ def _folded(loop: Loop, source: ErrorSource, T: float) -> Callable[[Array], Arra
 def panels(loop: Loop, source: ErrorSource, *, options: PanelOptions = PanelOptions()) -> Array:
     """Rising frequencies in Hz between which the densities are smooth, from end to end.
 
-    A table's own range. What is white goes on from far below the slowest to far above the fastest
+    A table's own range. What is white reaches from far below the slowest to far above the fastest
     pole, in a sampled loop to half the rate, beyond which the noise of samples is not counted.
     """
     roots = np.concatenate([loop.poles, loop.plant.poles, loop.controller.poles])

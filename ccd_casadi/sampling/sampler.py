@@ -200,7 +200,7 @@ class Sampler:
                 if not whole:  # it may be better with more time: who resumes searches it again
                     continue
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
-                if theta not in self.solved:  # who goes on from the store asks for it by this key
+                if theta not in self.solved:  # a run that resumes finds it by this key
                     own = sample_key(self.inner_hash, theta)
                     self.store.put_unit([], (own, self.inner_hash, theta, payload))
         for theta, key in keys.items():
