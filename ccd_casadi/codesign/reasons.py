@@ -63,7 +63,7 @@ class Reason(Enum):
     JUDGED_ON_PLANTS = (
         "stable and within every bound on the {plants} plants that it was designed on"
     )
-    ON_GRID_ALONE = "{on_grid_alone:list} on a grid of frequencies alone"
+    ON_GRID_ALONE = "{on_grid_alone:list}: judged on a grid of frequencies alone"
     DESIGNED_ON = "{words}, on which it was designed"
     JUDGED = "{words}"
     ENGINE_AGREES = "SLICOT agrees on {loops:count loop}"
