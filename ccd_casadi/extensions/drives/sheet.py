@@ -14,6 +14,7 @@ from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.box_proof import ProofOutcome
 from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.reporting.facts import theta_words
@@ -104,6 +105,8 @@ def proof_words(design: DriveDesign) -> str:
     """What is proven, in a sentence."""
     if design.proof is not None:
         left = "" if design.compliance is None else "; compliance is judged, not proven"
+        if design.proof.outcome is ProofOutcome.VARIES and not left:
+            left = "; give values of it as [robust] plants, which can be proven"
         return f"{design.proof.words}{left}"
     if len(design.certificate.plants) == 1:
         return "not needed: the set is one plant"
@@ -133,7 +136,7 @@ def sheet_figures(
                       "plants"))  # fmt: skip
     lowest = design.values[own.hertz].min(initial=np.inf) / rounded
     found.append(("filters", f"raise their gain to {design.rise:.4g} of rest, limit "
-                  f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, limit "
+                  f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, at least "
                   f"{own.filters_above:.4g}"))  # fmt: skip
     found.append(("decay", f"ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
                   f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}"))  # fmt: skip
@@ -194,7 +197,7 @@ def drive_page(
     notes += tuple(f"Not known: {words}" for words in own.unknown)
     return c.Page(head, (
         c.Chapter("As wired", (diagram(drive, design, today or {}),)),
-        c.Chapter("Figures", (c.Facts(tuple((*row, "") for row in figures)),)),
+        c.Chapter("Figures", (c.Table(("figure", "value"), tuple(figures)),)),
         c.Chapter("Sensitivity", (_sensitivity(drive, design),)),
         c.Chapter("What the manuals do not say", (c.Bullets(notes),), folded=True),
     ), index="")  # fmt: skip
