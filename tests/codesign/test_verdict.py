@@ -41,7 +41,7 @@ from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.reporting import decision
+from ccd_casadi.reporting import concerns, decision
 from ccd_casadi.reporting import run_verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import local_peaks_with_gradients
@@ -391,7 +391,7 @@ def test_the_sentences_of_decisions_are_short() -> None:
 def result_of(**states: str) -> dict:
     lines: dict[str, dict[str, Any]] = {
         name: {"state": "passed", "words": f"{name} words", "details": [f"{name} rests on it"]}
-        for name in decision.LINES
+        for name in concerns.LINES
     }
     for name, state in states.items():
         lines[name]["state"] = state
@@ -401,13 +401,13 @@ def result_of(**states: str) -> dict:
 def test_every_place_shows_the_same_lines() -> None:
     result = result_of(survives="warned", deployable="unknown")
     terminal = "\n".join([*shown.terminal_lines(result), *shown.detail_lines(result)])
-    page = block_html(Verdict(decision.lines_of(result)))
-    for name in decision.LINES:
+    page = block_html(Verdict(concerns.lines_of(result)))
+    for name in concerns.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
         assert f"{name} rests on it" in terminal
         assert f"{name} rests on it" in page
-    assert decision.worst_state(result) is v.State.WARNED
+    assert concerns.worst_state(result) is v.State.WARNED
     assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)
@@ -420,8 +420,8 @@ def test_every_place_shows_the_same_lines() -> None:
 
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
-    assert decision.lines_of(damage) == ()
-    assert block_html(Verdict(decision.lines_of(damage))) == ""
+    assert concerns.lines_of(damage) == ()
+    assert block_html(Verdict(concerns.lines_of(damage))) == ""
 
 
 def test_the_words_of_a_set_name_its_evidence_beside_the_levels_that_a_proof_left() -> None:

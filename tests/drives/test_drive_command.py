@@ -10,6 +10,7 @@ import pytest
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.check import main as check
+from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drive import main
 from ccd_casadi.extensions.drives.cascade_rows import split
 from ccd_casadi.extensions.drives.drive_case import drive_problem
@@ -120,4 +121,6 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
         assert f"{row['number']} {row['name'].split(', ')[-1]}".strip() in page
         assert f">{row['value']:.10g}<" in page
     assert [row["today"] for row in answer["parameters"]].count(None) == 11
+    assert deploy([str(out)]) == 2
+    assert "the folder is of `ccd drive`" in capsys.readouterr().err
     assert "cascade_step" in (out / "cascade.c").read_text("utf-8")
