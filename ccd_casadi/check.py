@@ -16,7 +16,7 @@ from ccd_casadi.support.text import counted
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
-    from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.cases.case_problem import plain_case, problem_of
     from ccd_casadi.cases.diagnosis import PlantReportOptions, diagnose, plant_report
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.reporting.facts import theta_words
@@ -24,7 +24,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.text import template
 
     case = load_case(options.case)
-    problem = problem_of(case)
+    problem = problem_of(plain_case(case))
     facts, findings = diagnose(problem, case.suspension.rigid_modes, options.seed)
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
@@ -41,7 +41,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         say(
             words.render(found, start=theta_words(found), shares=PlantReportOptions.shares).rstrip()
         )
-        inform(f"next          {program('ccd_casadi.solve')} {options.case}")
+        designs = "drive" if case.drive.name else "tolerances" if case.robust.share else "solve"
+        inform(f"next          {program(f'ccd_casadi.{designs}')} {options.case}")
     return ExitCode.DONE
 
 

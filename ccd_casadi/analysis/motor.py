@@ -265,7 +265,8 @@ def motion_at(
     ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
     found = cycle_of(motion, ahead[2], mass)
     if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
-        raise UserError("move: a spring holds the output that moves, and its force is not counted")
+        words = "a spring holds the output that moves, and its force is not counted"
+        raise UserError(f"move: {words}; drop [move], and give `ccd robustness` the stroke")
     step = 1j * options.complex_step
     stepped = tuple(
         cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place))

@@ -8,7 +8,7 @@ from typing import Any
 
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
-from ccd_casadi.cases.controller_tables import filters_of, motion_problem
+from ccd_casadi.cases.controller_tables import DriveTable, filters_of, motion_problem
 from ccd_casadi.cases.tables import BudgetTable, Case, PlacesTable, RobustTable
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
@@ -35,6 +35,25 @@ from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.user_code import GivenFunction, raised_words
 from ccd_casadi.support.worker_process import one_blas_thread
+
+
+def plain_case(case: Case) -> Case:
+    """Leave out what `ccd drive` and `ccd tolerances` alone design: the plants remain.
+
+    Parameters
+    ----------
+    case : Case
+
+    Returns
+    -------
+    Case
+        Without [drive], its bound of the compliance, and [robust] share.
+    """
+    case = replace(case, robust=replace(case.robust, share=None))
+    if case.drive.name is None:
+        return case
+    inner = replace(case.inner, compliance_max=None)  # of the table's force, not the sensors'
+    return replace(case, drive=DriveTable(), inner=inner)
 
 
 @one_blas_thread

@@ -271,7 +271,7 @@ def plant_report(
         "notes": list(plant.notes(problem.start)),
         "theta": dict(zip(problem.names, problem.start, strict=True)),
         "varies": {p.name: [p.lower, p.upper] for p in case.fixed if p.varies},
-        "units": {parameter.name: parameter.unit for parameter in case.theta},
+        "units": {parameter.name: parameter.unit for parameter in (*case.theta, *case.fixed)},
         "points": len(facts),
         "size": size_words(start, case, options=options),
         "inertia": start.inertia,

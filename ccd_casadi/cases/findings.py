@@ -20,7 +20,7 @@ from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.plant_facts import PlantFacts
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import HZ, is_force, of_newtons, spoken
+from ccd_casadi.support.text import HZ, is_force, number, of_newtons, spoken
 
 
 @dataclass(frozen=True)
@@ -177,9 +177,9 @@ def _effort(
     if not is_force(problem.spoken[1]):
         units = spoken("M_K, which is in N/m, and of the plant's input and output")
     return [
-        f"weights.M_K = {M_K:.3g} looks {max(gain, 1.0 / gain):.1g} times too {side}: {where}, "
-        f"and [inner] searches {low:.3g} to {high:.3g} Hz; {M_K / gain:.2g} would suit a bandwidth "
-        f"of {aim:.3g} Hz. Check the units of {units}"
+        f"weights.M_K = {M_K:.3g} looks {number(max(gain, 1.0 / gain), 1)} times too {side}: "
+        f"{where}, and [inner] searches {low:.3g} to {high:.3g} Hz; {M_K / gain:.2g} would suit "
+        f"a bandwidth of {aim:.3g} Hz. Check the units of {units}"
     ]
 
 

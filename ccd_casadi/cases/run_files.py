@@ -37,7 +37,10 @@ def read_json(path: Path) -> Mapping[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file; solve the case first") from None
+        words = "solve the case first"
+        if (path.parent / "drive.json").exists():
+            words = "the folder is of `ccd drive`, whose answer is sheet.txt and cascade.c"
+        raise UserError(f"{path}: there is no such file; {words}") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}; make the run again") from None
     except (ValueError, RecursionError):

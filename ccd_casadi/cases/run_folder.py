@@ -14,7 +14,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_channels import loop_figures
 from ccd_casadi.cases.case import load_case
-from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.case_problem import plain_case, problem_of
 from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.cases.run_files import (
     controller_of,
@@ -221,7 +221,7 @@ def read_run(
     if share and not of_share:
         words = f"is {share}; name a run of the whole box, or use `ccd deploy` or `ccd robustness`"
         raise UserError(f"{folder}: {words}")
-    problem = problem_of(replace(case, robust=replace(case.robust, share=None)))
+    problem = problem_of(plain_case(case))
     theta = theta_of(folder / "result.json", result, problem)
     if isinstance(problem.controller, StructuredProblem):
         found = _read_structured(folder, problem, theta, result, of_share=bool(share))

@@ -381,7 +381,7 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     found = result["listed"]
     units = dict(zip(problem.names, problem.units, strict=True))
     named = ", ".join(
-        f"{name} = {value:g} {units[name]}".strip() + f" of {len(found['values'][name])}"
+        f"{name} = {value:g} {units[name]}".strip() + f" (of {len(found['values'][name])} values)"
         for name, value in found["chosen"].items()
     )
     above, free = found["objective_above_free"], ""
@@ -400,4 +400,10 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         counts += f" parts is J {found['least_of_cut']:.6g} or more"
     if found["without_design"]:
         counts += f", {found['without_design']} in parts where no design was found"
+    for one in found["nodes"]:
+        single = all(len(values) == 1 for values in one["lists"].values())
+        if single and one["status"] == "not_verified" and one["objective"] < result["objective"]:
+            values = ", ".join(f"{name} = {value:g}" for name, (value,) in one["lists"].items())
+            counts += f"; not verified with J {one['objective']:.6g}, which is less: {values}"
+            counts += " (fix these values to see why)"
     return f"listed values: {named}{free}; {counts}"

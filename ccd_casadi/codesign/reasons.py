@@ -63,7 +63,7 @@ class Reason(Enum):
     JUDGED_ON_PLANTS = (
         "stable and within every bound on the {plants} plants that it was designed on"
     )
-    ON_GRID_ALONE = "{on_grid_alone:list} on a grid of frequencies alone"
+    ON_GRID_ALONE = "{on_grid_alone:list}: judged on a grid of frequencies alone"
     DESIGNED_ON = "{words}, on which it was designed"
     JUDGED = "{words}"
     ENGINE_AGREES = "SLICOT agrees on {loops:count loop}"
@@ -345,9 +345,10 @@ def _sides(known: Mapping[str, Any]) -> str:
 
 
 def _range(known: Mapping[str, Any], name: str) -> str:
-    """Of resonance shifts in %; one that was not followed further has a ">"."""
+    """Of resonance shifts in %; one that was not followed further has a "<" or ">"."""
     ends = [math.nan if end is None else end for end in known[name]]
-    beyond = [">" if abs(end) >= 0.999 * known["shift_followed_to"] else "" for end in ends]
+    most = 0.999 * known["shift_followed_to"]
+    beyond = [mark if abs(end) >= most else "" for mark, end in zip("<>", ends, strict=True)]
     shown = [inwards(100.0 * end, 2, 3) for end in ends]  # less is none
     return f"{beyond[0]}{shown[0]:+g} to {beyond[1]}{shown[1]:+g} %"
 

@@ -263,7 +263,7 @@ class VerifiedStructured(Verified):
         kept = (Reason.JUDGED_ON_MODEL if count == 1 else Reason.JUDGED_ON_PLANTS)(plants=count)
         if on_grid:  # a check that does not exist for a sampled loop is not passed
             figures["on_grid_alone"] = on_grid
-            return line(State.WARNED, (kept, Reason.ON_GRID_ALONE()))
+            return line(State.WARNED, (Reason.ON_GRID_ALONE(), kept))
         return line(State.PASSED, (kept,))
 
     def own_set(self) -> dict[str, Any]:

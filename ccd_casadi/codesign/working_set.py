@@ -53,7 +53,7 @@ class WorkingSet:
         at: JointPoint,
         options: WorkingSetOptions = WorkingSetOptions(),
     ) -> "WorkingSet":
-        """Without the plants that do not hold the controller there."""
+        """Without the plants that do not hold the controller there, but with the model."""
         problem = self.sampler.problem
         scenarios = state_of(problem).scenarios
         if len(scenarios) <= options.most_plants:
@@ -69,7 +69,8 @@ class WorkingSet:
         kept = holding(
             loops.plants_of(rows), list(map(tuple, gains)), np.log(rows.v), rows.value, options
         )
-        kept |= {number for number, one in enumerate(scenarios) if one in self.back}
+        # the first is the model, of which results and pages state figures
+        kept |= {number for number, one in enumerate(scenarios) if not number or one in self.back}
         counted = tuple(one for number, one in enumerate(scenarios) if number in kept)
         aside = (one for number, one in enumerate(scenarios) if number not in kept)
         changed = with_state(problem, scenarios=counted)

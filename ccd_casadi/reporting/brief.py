@@ -147,7 +147,7 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
         limits=_limits(problem, result)[: options.limits],
         ifs=list(what_if(result, options.shift, options.gain)),
         risks=risks(result)[: options.risks],
-        notes=(_checks(result), f"Next: {_next(decided, result)}.", _evidence(result),
+        notes=(_checks(result), f"Next: {_next(decided, result)}.", evidence(result),
                _reproduce(run)),
     )  # fmt: skip
 
@@ -237,14 +237,17 @@ def _limits(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
     return binds or ["Nothing binds: an interior optimum."]
 
 
-def _evidence(result: Mapping[str, Any]) -> str:
+def evidence(result: Mapping[str, Any]) -> str:
+    """Who judged a design, and which of its requirements are proven."""
     judge = result.get("judge", {})
     second = result.get("second_engine", {}).get("words", "")
     words = [f"An independent judge (NumPy, on the matrices as written): {judge.get('words', '')}"]
-    if any(one["evidence"] == "proven" for one in result.get("requirements", ())):
+    required = result.get("requirements", ())
+    proven = [one["name"] for one in required if one["evidence"] == "proven"]
+    if proven:
         names = result.get("proof", {}).get("parameters", ())
         over = f"the whole [robust] set ({', '.join(names)})" if names else "these plants alone"
-        words.append(f"Proven: at every frequency, for {over}")
+        words.append(f"Proven for {over}: {', '.join(proven)}")
     return ". ".join(filter(None, (*words, second))) + "."
 
 

@@ -25,6 +25,8 @@ class ConcernKind(StrEnum):
     LINE_WARNED = "line_warned"
     LINE_UNKNOWN = "line_unknown"
     NOT_VERIFIED = "not_verified"
+    NOT_OPTIMAL = "not_optimal"
+    MISPREDICTED = "mispredicted"
     MODEL_ALONE = "model_alone"
     SMALL_ERRORS = "small_errors"
     SURVIVAL_UNKNOWN = "survival_unknown"

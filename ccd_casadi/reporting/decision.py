@@ -62,6 +62,11 @@ class Build(StrEnum):
     NOTHING = "nothing"
 
 
+# Lines that may fail with every bound kept, the checks behind them, and what is to be accepted.
+BOUNDS_KEPT = {
+    "optimal": (("optimality", "inner_optimum"), ConcernKind.NOT_OPTIMAL, "it is not the optimum"),
+    "predicted": (("prediction",), ConcernKind.MISPREDICTED, "the surrogate mispredicts it"),
+}
 SENTENCES = {
     Build.YES: "Build this.",
     Build.AFTER_DEPLOY: "Build this after deploy: hold and delay are not judged yet.",
@@ -139,7 +144,10 @@ def decide(result: Mapping[str, Any]) -> Decision:
     failed = [name for name, state in states.items() if state == State.FAILED]
     move = limited_move(result)
     beside = (Concern(ConcernKind.MOVE, move),) if move else ()
-    if failed or result.get("status") != "verified":
+    kept = [name for name in failed if name in BOUNDS_KEPT]
+    excused = {check for name in kept for check in BOUNDS_KEPT[name][0]}
+    denied = {name for name, good in result.get("checks", {}).items() if good is False}
+    if kept != failed or denied - excused or not (failed or result.get("status") == "verified"):
         why = Concern(ConcernKind.NOT_VERIFIED, "it is not verified")
         if failed:
             why = Concern(ConcernKind.LINE_FAILED, f"{' and '.join(failed)} failed")
@@ -164,7 +172,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
     ]
     searched = [one for one in survival if one.reason is ConcernKind.SET_SEARCHED]
     weighed = [one for one in survival if one.reason is not ConcernKind.SET_SEARCHED]
-    concerns = [*weighed, *warned, *searched]
+    missed = [Concern(*BOUNDS_KEPT[name][1:]) for name in kept]
+    concerns = [*missed, *weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
         words = f"the search was ended by its budget of {budget['minutes']:g} min"
@@ -179,6 +188,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
         build = Build.AFTER_DEPLOY if unjudged else Build.YES
         return Decision(build, unjudged=unjudged, condition=condition)
     remedies = {
+        ConcernKind.NOT_OPTIMAL: "optimal",
+        ConcernKind.MISPREDICTED: "predicted",
         ConcernKind.SET_UNPROVEN: "unproven",
         ConcernKind.CURRENT: "current",
         ConcernKind.LOOP: "loop",

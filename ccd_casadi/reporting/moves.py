@@ -58,7 +58,9 @@ def move_blocks_of(
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        other = "; set your own under [move]"
+        refused = ahead is None or problem.source.wiring  # by a [move]: on a spring, or filtered
+        own = "robustness takes another" if refused else "set your own under [move]"
+        other = f"; {own}"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip

@@ -292,6 +292,13 @@ def test_a_design_that_is_not_verified_cuts_no_verified_one(seed: int) -> None:
     assert best.result["status"] == "verified"
     least = min(item["objective"] for item in verified)
     assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
+    passed_over = [
+        node
+        for node in best.result["listed"]["nodes"]
+        if node["status"] == "not_verified" and all(len(v) == 1 for v in node["lists"].values())
+    ]
+    words = best.result["notes"][-1]
+    assert words.count("fix these values to see why") == len(passed_over)
 
 
 @pytest.fixture(scope="module")

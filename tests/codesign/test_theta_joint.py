@@ -21,11 +21,12 @@ from ccd_casadi.codesign.theta_joint import (
     objectives_beside,
     polled,
 )
+from ccd_casadi.codesign.working_set import WorkingSet, WorkingSetOptions
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.searched_problem import with_state
+from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, to_first_order
@@ -238,3 +239,18 @@ def test_where_each_theta_is_dear_none_is_sampled() -> None:
     assert chosen == {
         "rib_stage_built": "direct", "two_mass_built": "nested", "rib_stage": "nested"
     }  # fmt: skip
+
+
+def test_a_working_set_keeps_the_model_as_its_first_plant(tmp_path: Path) -> None:
+    """Figures "of the model" are of the first, though at the optimum others hold the controller."""
+    problem = built()
+    theta = problem.start
+    at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * STORED["bandwidth_hz"])
+    with SampleStore(tmp_path / "samples.sqlite") as store:
+        working = WorkingSet(Sampler(problem, store, Workers(1)))
+        few = working.reduced(nearby(problem, (), theta), at, WorkingSetOptions(most_plants=1))
+    left = state_of(few.sampler.problem).scenarios
+    assert left[0] == (0, tuple(map(float, uncertain_plant(problem, theta).nominal)))
+    assert left[0] not in few.aside
+    assert set(left) | set(few.aside) == set(state_of(problem).scenarios)
+    assert few.aside

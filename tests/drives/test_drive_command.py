@@ -9,6 +9,8 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.check import main as check
+from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drive import main
 from ccd_casadi.extensions.drives.cascade_rows import split
 from ccd_casadi.extensions.drives.drive_case import drive_problem
@@ -69,9 +71,15 @@ def test_a_force_that_nothing_bounds_is_named() -> None:
         drive_problem(parse_case(data, FEED))
 
 
-def test_other_commands_refuse_a_case_with_a_drive() -> None:
+def test_other_commands_refuse_a_case_with_a_drive(capsys: pytest.CaptureFixture[str]) -> None:
+    """But `check`, whose next step is `ccd drive`."""
     with pytest.raises(UserError, match="ccd drive"):
         problem_of(parse_case(read_toml(EXAMPLE), EXAMPLE))
+    assert check([str(FEED)]) == 0
+    words = capsys.readouterr().out
+    assert "every load from 0 to 300 kg" in words
+    assert words.splitlines()[-1].startswith("next")
+    assert "drive " in words.splitlines()[-1]
 
 
 def test_the_command_writes_a_sheet_and_says_what_is_proven(
@@ -100,10 +108,19 @@ def test_the_command_writes_a_sheet_and_says_what_is_proven(
     sheet = (out / "sheet.txt").read_text("utf-8")
     assert "p1417" in sheet
     assert "500" in sheet
+    assert f"load = {answer['theta']['load']:.5g} kg" in sheet
+    for place in ("motor", "load", "actuator"):
+        share = answer["judge"]["shares"][f"S_max of {place}"]
+        assert f"{2.0 * share:.4g} (limit 2) at {place}" in sheet
     page = (out / "report.html").read_text("utf-8")
     assert "|S| is below -3 dB up to" in page  # where the shape binds, |S| crosses -3 dB later
+    for line in sheet.splitlines():  # what the sheet says of the design, the page says too
+        if line.startswith(("peaks of S", "judged", "filters")):
+            assert line[14:] in page
     for row in answer["parameters"]:  # each block of the diagram, as the drive names and writes it
         assert f"{row['number']} {row['name'].split(', ')[-1]}".strip() in page
         assert f">{row['value']:.10g}<" in page
     assert [row["today"] for row in answer["parameters"]].count(None) == 11
+    assert deploy([str(out)]) == 2
+    assert "the folder is of `ccd drive`" in capsys.readouterr().err
     assert "cascade_step" in (out / "cascade.c").read_text("utf-8")

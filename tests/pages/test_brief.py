@@ -9,7 +9,14 @@ from pathlib import Path
 
 from ccd_casadi import report
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.reporting.brief import BriefOptions, bars, before_and_after, brief_html, nearest
+from ccd_casadi.reporting.brief import (
+    BriefOptions,
+    bars,
+    before_and_after,
+    brief_html,
+    evidence,
+    nearest,
+)
 from ccd_casadi.reporting.concerns import risks, what_if
 
 OPTIONS = BriefOptions()
@@ -54,6 +61,14 @@ def test_what_is_not_known_is_kept_and_is_no_zero() -> None:
     assert [bar.name for bar in found] == ["0", "1", "8"]
     assert found[-1].achieved == "not known"
     assert math.isnan(found[-1].used)
+
+
+def test_the_brief_names_what_is_proven_and_nothing_else() -> None:
+    made = [{"name": name, "evidence": how} for name, how in
+            (("S_max", "searched"), ("S_low", "proven"), ("too heavy", "judged"))]  # fmt: skip
+    words = evidence({"requirements": made, "proof": {"parameters": ["gain"]}})
+    assert "Proven for the whole [robust] set (gain): S_low." in words
+    assert "S_max" not in words
 
 
 def test_the_brief_of_a_run(two_mass_run: Path, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_a_set_is_advised_only_where_the_case_names_none(state: str, own: OwnSet
     move=st.sampled_from(["none", "passed", "failed", "unknown"]),
     verified=st.booleans(),
 )
-def test_no_decision_builds_what_failed_or_is_not_known(
+def test_no_decision_builds_what_breaks_a_bound_or_is_not_known(
     states: dict, own: OwnSet | None, ended: bool, move: str, verified: bool
 ) -> None:
     result = result_of(**states)
@@ -81,7 +81,9 @@ def test_no_decision_builds_what_failed_or_is_not_known(
     found = decide(result)
     reasons = {one.reason for one in found.concerns}
     assert found.builds != found.refuses
-    if not verified or "failed" in states.values() or move in ("failed", "unknown"):
+    failed = {name for name, state in states.items() if state == "failed"}
+    missed = failed <= {"optimal", "predicted"}  # with every bound kept
+    if not missed or not (verified or failed) or move in ("failed", "unknown"):
         assert found.refuses
     if found.build in (Build.YES, Build.AFTER_DEPLOY):
         assert not reasons
@@ -148,6 +150,24 @@ def test_an_older_run_names_no_condition_and_other_decisions_name_it_too() -> No
         result["verdict"]["survives"] |= {**shift, "set_shift": [0.0, 0.0]}
         assert resonance_condition(result) == said
         assert advice(result).endswith(f" {said}")
-    failed = result_of(optimal="failed")
+    failed = result_of(certified="failed")
     failed["verdict"]["survives"] |= {**shift, "set_shift": [0.0, 0.0]}
     assert "Condition" not in advice(failed)
+
+
+@pytest.mark.parametrize("name", ["optimal", "predicted"])
+def test_a_design_that_keeps_every_bound_is_not_refused_for_what_it_misses(name: str) -> None:
+    """A safe loop beside the optimum may be built; one that misses a bound as well may not."""
+    result = result_of(**{name: "failed"}) | {"status": "not_verified"}
+    check = "optimality" if name == "optimal" else "prediction"
+    result["checks"] = {check: False, "certificate": True, "robust": True}
+    found = decide(result)
+    assert found.build is Build.IF_ACCEPTED
+    assert NEXT[name] in found.steps
+    for lost in ("certificate", "robust", "judge"):
+        result["checks"] = {check: False, lost: False}
+        assert decide(result).build is Build.NO
+    for other in ("certified", "survives", "deployable"):
+        both = result_of(**{name: "failed", other: "failed"}) | {"status": "not_verified"}
+        assert decide(both).build is Build.NO
+    assert decide(result_of() | {"status": "not_verified"}).build is Build.NO

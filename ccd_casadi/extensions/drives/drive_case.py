@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.cases.case import Case
-from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.case_problem import plain_case, problem_of
 from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.cases.controller_tables import DriveTable
 from ccd_casadi.extensions.drives.cascade import Cascade
@@ -28,6 +28,7 @@ class DriveProblem:
     `ported`: the plants with their ports, where compliance_max bounds what a force moves."""
 
     problem: CoDesignProblem
+    theta: tuple[float, ...]  # in the case's units
     cascade: Cascade
     uncertain: UncertainPlant
     bounds: Bounds
@@ -62,8 +63,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             words = f"{drive.title} has no cascade; its PID is not designed yet"
             raise UserError(f"{words}: use `ccd tune`, or another drive")
         most = case.inner.compliance_max
-        inner = replace(case.inner, compliance_max=None)  # of the table's force, not the sensors'
-        problem = problem_of(replace(case, drive=DriveTable(), inner=inner))
+        problem = problem_of(plain_case(case))
         if not isinstance(problem.controller, StructuredProblem):
             raise UserError('controller.structure is not "sections"; a drive needs that')
         if problem.sampling is None:
@@ -84,7 +84,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
                           _slower(table, problem.sampling, bounds.omega_low),
                           HZ * (table.compliance_hz or np.inf))  # fmt: skip
         require_known(cascade, bounds)
-        at = problem.start if theta is None else theta
+        at = problem.start if theta is None else tuple(theta)
         uncertain, ported = uncertain_plant(problem, at), None
         if most is not None:
             ported = uncertain_plant(with_ports(problem), at)
@@ -96,7 +96,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         raise
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
-    return DriveProblem(problem, cascade, uncertain, bounds, problem.sampling, ported)
+    return DriveProblem(problem, at, cascade, uncertain, bounds, problem.sampling, ported)
 
 
 def _slower(table: DriveTable, sampling: Sampling, omega_low: float) -> int:

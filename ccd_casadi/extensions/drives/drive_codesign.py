@@ -66,7 +66,7 @@ class DriveAt:
     Attributes
     ----------
     theta : tuple of float
-        SI.
+        In the case's units.
     cost, objective : float
         f(θ) and J.
     candidate : Candidate

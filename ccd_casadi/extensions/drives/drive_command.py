@@ -38,8 +38,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         entry,
         figures_of,
         move_errors,
-        named_theta,
         proof_words,
+        sheet_figures,
         sheet_text,
     )
     from ccd_casadi.reporting.facts import run_name
@@ -72,8 +72,8 @@ def main(options: argparse.Namespace) -> ExitCode:
             DriveCodesignOptions(drive=numbers),
         )  # fmt: skip
         problem, near = drive_problem(case, best.theta), best.candidate
-        searched = {"theta": named_theta(problem, best), "codesign": {
-            "start": figures_of(problem, first), "best": figures_of(problem, best)}}  # fmt: skip
+        searched = {"codesign": {"start": figures_of(problem, first),
+                                 "best": figures_of(problem, best)}}  # fmt: skip
     with Workers(options.workers) as workers:
         found = design_drive(
             problem.cascade, problem.uncertain, problem.bounds, problem.sampling,
@@ -81,16 +81,17 @@ def main(options: argparse.Namespace) -> ExitCode:
             progress=lambda words: remark(words, options.quiet), ported=problem.ported,
         )  # fmt: skip
     moved = move_errors(problem, found)
-    text = sheet_text(found, today, moved)
+    figures = sheet_figures(problem, found, moved)
+    text = sheet_text(found, figures, today)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
     code = program_of(found.cascade, found.values, found.ahead).code(run_name(folder))
     (folder / "cascade.c").write_text(code, "utf-8")
     run = {"seconds": options.seconds(), "seed": options.seed, "versions": versions()}
-    answer = entry(found, today, moved) | searched | run
+    answer = entry(problem, found, today, moved) | searched | run
     write_json(folder / "drive.json", answer)
-    write_page(folder / "report.html", drive_page(run_name(folder), problem, found, today))
+    write_page(folder / "report.html", drive_page(run_name(folder), problem, found, figures, today))
     if searched:
-        text = f"{codesign_words(searched['codesign'])}\n{text}"
+        text = f"{codesign_words(problem, searched['codesign'])}\n{text}"
     inform(text)
     inform(f"page          {folder / 'report.html'}")
     if found.status == "verified":

@@ -1,7 +1,7 @@
 """The sheet that a person types into a drive: numbers, names, values, units; as text, as JSON, and
 as a page that draws the cascade as wired, with |S| at every place where the loop may be broken."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,11 @@ from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.two_rates import lift
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.box_proof import ProofOutcome
 from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import sampled
+from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.gain_figures import bandwidth_level, sensitivity_panel
 from ccd_casadi.support.text import HZ, number, template
 
@@ -46,13 +49,17 @@ def move_errors(drive: DriveProblem, design: DriveDesign) -> tuple[float, float]
 
 
 def entry(
-    design: DriveDesign, today: Today | None = None, moved: tuple[float, float] | None = None
+    problem: DriveProblem,
+    design: DriveDesign,
+    today: Today | None = None,
+    moved: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Everything that is known, as JSON holds it; `moved` by `move_errors`."""
     drive, judged, bounds = design.cascade.drive, design.certificate, design.certificate.worst
     return {
         "status": design.status,
         "drive": drive.title,
+        "theta": named_theta(problem, problem.theta),
         "rate_hz": 1.0 / design.cascade.period,
         "bandwidth_hz": design.bandwidth / HZ,
         "free_bandwidth_hz": design.free.bandwidth / HZ,
@@ -73,23 +80,24 @@ def entry(
     }  # fmt: skip
 
 
-def named_theta(problem: DriveProblem, at: DriveAt) -> dict[str, float]:
-    """θ by name, SI."""
-    return dict(zip(problem.problem.names, at.theta, strict=True))
+def named_theta(problem: DriveProblem, theta: Sequence[float]) -> dict[str, float]:
+    """θ by name, in the case's units."""
+    return dict(zip(problem.problem.names, theta, strict=True))
 
 
 def figures_of(problem: DriveProblem, at: DriveAt) -> dict[str, Any]:
     """What is known of a θ before rounding."""
-    return {"theta": named_theta(problem, at), "bandwidth_hz": at.candidate.bandwidth / HZ,
+    return {"theta": named_theta(problem, at.theta), "bandwidth_hz": at.candidate.bandwidth / HZ,
             "hardware_cost": at.cost, "objective": at.objective}  # fmt: skip
 
 
-def codesign_words(entry: Mapping[str, Any]) -> str:
+def codesign_words(problem: DriveProblem, entry: Mapping[str, Any]) -> str:
     """Both designs of a co-design, a line each."""
+    units = problem.problem.parameter_units
     return "\n".join(
         f"{name:14s}J {number(one['objective'], 5)}, {number(one['bandwidth_hz'], 4)} Hz, cost "
-        f"{number(one['hardware_cost'], 4)} at "
-        + ", ".join(f"{key} = {number(value)}" for key, value in one["theta"].items())
+        f"{number(one['hardware_cost'], 4)} {problem.problem.cost_unit}".rstrip()
+        + f" at {theta_words({'theta': one['theta'], 'units': units})}"
         for name, one in entry.items()
     )
 
@@ -98,16 +106,65 @@ def proof_words(design: DriveDesign) -> str:
     """What is proven, in a sentence."""
     if design.proof is not None:
         left = "" if design.compliance is None else "; compliance is judged, not proven"
+        if design.proof.outcome is ProofOutcome.VARIES and not left:
+            left = "; give values of it as [robust] plants, which can be proven"
         return f"{design.proof.words}{left}"
     if len(design.certificate.plants) == 1:
         return "not needed: the set is one plant"
     return "there is none of two rates; between the judged plants nothing is proven"
 
 
+def sheet_figures(
+    problem: DriveProblem, design: DriveDesign, moved: tuple[float, float] | None = None
+) -> list[tuple[str, str]]:
+    """What the design reaches, each figure with its limit; `moved` by `move_errors`."""
+    own, (Kv, _, Tn), of = design.cascade, design.values[:3], problem.problem
+    rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
+    found = []
+    if of.names:
+        named = {"theta": named_theta(problem, problem.theta), "units": of.parameter_units}
+        found.append(("hardware", theta_words(named)))
+    found += [
+        ("bandwidth", f"{rounded:.4g} Hz, the least of the plants; {free:.4g} Hz before rounding, "
+         "on fewer"),
+        ("peaks of S", _peaks(problem, design)),
+        ("judged", design.certificate.words),
+        ("proof", proof_words(design)),
+    ]  # fmt: skip
+    if design.compliance is not None:
+        until = "" if np.isinf(own.stiff_below) else f" up to {own.stiff_below / HZ:.4g} Hz"
+        found.append(("compliance", f"at most {design.compliance:.4g} m/N{until} on the judged "
+                      "plants"))  # fmt: skip
+    lowest = design.values[own.hertz].min(initial=np.inf) / rounded
+    found.append(("filters", f"raise their gain to {design.rise:.4g} of rest, limit "
+                  f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, at least "
+                  f"{own.filters_above:.4g}"))  # fmt: skip
+    found.append(("decay", f"ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
+                  f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}"))  # fmt: skip
+    if moved is not None:
+        o = ArithmeticOptions()
+        found.append(("move", f"{1e3 * o.distance:g} mm in {o.seconds:g} s: off by "
+                      f"{1e6 * moved[0]:.4g} µm at most, {1e6 * moved[1]:.4g} µm without "
+                      "feedforward"))  # fmt: skip
+    return found
+
+
+def _peaks(problem: DriveProblem, design: DriveDesign) -> str:
+    """The largest |S| of the judged plants at every place, and its bound."""
+    bounds, worst = problem.bounds, design.certificate.worst
+    own = {one.name: one.S_max or bounds.S_max for one in bounds.channels}
+    limits = own or {"": bounds.S_max}
+    shares = {kind_and_channel(name)[1]: share for name, share in worst.items()
+              if kind_and_channel(name)[0].upper() == "S_MAX"}  # fmt: skip
+    return ", ".join(f"{number(shares[name] * limit, 4)} (limit {number(limit)}) at "
+                     f"{name or 'the sensor'}" for name, limit in limits.items() if name in shares
+                     ) or "not known: a loop is not stable"  # fmt: skip
+
+
 def sheet_text(
-    design: DriveDesign, today: Today | None = None, moved: tuple[float, float] | None = None
+    design: DriveDesign, figures: Sequence[tuple[str, str]], today: Today | None = None
 ) -> str:
-    """The sheet as text, `today`'s values beside the new ones; `moved` by `move_errors`."""
+    """The sheet as text, `today`'s values beside the new ones; figures of `sheet_figures`."""
     head = ["number", "parameter", "new", "unit"] if today is None else [
         "number", "parameter", "today", "new", "unit"]  # fmt: skip
     lines = [head]
@@ -119,34 +176,15 @@ def sheet_text(
     table = ["  ".join(part.ljust(width) for part, width in zip(line, widths, strict=True)).rstrip()
              for line in lines]  # fmt: skip
     drive = design.cascade.drive
-    found = [drive.title, *table, ""]
-    rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
-    found.append(f"bandwidth     {rounded:.4g} Hz; {free:.4g} Hz before rounding, on fewer plants")
-    found.append(f"judged        {design.certificate.words}")
-    found.append(f"proof         {proof_words(design)}")
-    own, (Kv, _, Tn) = design.cascade, design.values[:3]
-    if design.compliance is not None:
-        until = "" if np.isinf(own.stiff_below) else f" up to {own.stiff_below / HZ:.4g} Hz"
-        found.append(f"compliance    at most {design.compliance:.4g} m/N{until} on the judged "
-                     "plants")  # fmt: skip
-    lowest = design.values[own.hertz].min(initial=np.inf) / rounded
-    found.append(f"filters       raise their gain to {design.rise:.4g} of rest, limit "
-                 f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, limit "
-                 f"{own.filters_above:.4g}")  # fmt: skip
-    found.append(f"decay         ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
-                 f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}")  # fmt: skip
-    if moved is not None:
-        o = ArithmeticOptions()
-        found.append(f"move          {1e3 * o.distance:g} mm in {o.seconds:g} s: off by "
-                     f"{1e6 * moved[0]:.4g} µm at most, {1e6 * moved[1]:.4g} µm without "
-                     "feedforward")  # fmt: skip
+    found = [drive.title, *table, "", *(f"{name:14s}{words}" for name, words in figures)]
     found += [f"chosen        {words}" for words in drive.chosen]
     found += [f"not known     {words}" for words in drive.unknown]
     return "\n".join(found)
 
 
 def drive_page(
-    title: str, drive: DriveProblem, design: DriveDesign, today: Today | None = None
+    title: str, drive: DriveProblem, design: DriveDesign, figures: Sequence[tuple[str, str]],
+    today: Today | None = None,
 ) -> c.Page:  # fmt: skip
     """Make report.html."""
     own = design.cascade.drive
@@ -160,6 +198,7 @@ def drive_page(
     notes += tuple(f"Not known: {words}" for words in own.unknown)
     return c.Page(head, (
         c.Chapter("As wired", (diagram(drive, design, today or {}),)),
+        c.Chapter("Figures", (c.Table(("figure", "value"), tuple(figures)),)),
         c.Chapter("Sensitivity", (_sensitivity(drive, design),)),
         c.Chapter("What the manuals do not say", (c.Bullets(notes),), folded=True),
     ), index="")  # fmt: skip
@@ -226,5 +265,5 @@ def _sensitivity(drive: DriveProblem, design: DriveDesign) -> c.Figure:
         curves.append(c.Curve(hz, S, f"broken at {name}", colour))
     panel = sensitivity_panel(curves, (low, high), bounds.S_max,
                               (bandwidth_level(design.bandwidth / HZ),), "|S| (–)")  # fmt: skip
-    words = "Of the model. Other plants of the set are judged and proven, not drawn."
+    words = "Of the model; the bandwidth is the least of the set, whose other plants are not drawn."
     return c.Figure(c.Lines(((panel,),), "Sensitivity over frequency", (3.4,)), words)
