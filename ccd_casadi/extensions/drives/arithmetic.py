@@ -1,8 +1,8 @@
 """A cascade's difference equations as they run: in Python, and the same as C.
 
 Counts of the encoders in, force out. Gains and the PI compute in the drive's floating point; a
-fixed-point filter takes and gives integers of `grain` N, its products summed in 64 bits and shifted
-right by 30, towards minus infinity.
+fixed-point filter takes and gives integers of `grain` N, its exact sum of products shifted
+right by 30, towards minus infinity; the C does so in 64 bits by halves of the coefficients.
 """
 
 from dataclasses import dataclass
@@ -111,8 +111,12 @@ class Program:
 
         rows = [f"    {{{', '.join(map(value, own))}}}" for own in (*self.setpoint, *self.current)]
         count, n = len(rows), len(self.setpoint)
-        inside = ("x = llrint(u / GRAIN)", f"y >>= {self.options.bits}", "(real)(y * GRAIN)") \
-            if self._fixed else ("x = u", "", "y")  # fmt: skip
+        inside = ("x = u", "c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3]", "y")
+        if self._fixed:  # of a whole product 64 bits hold no more than 8 kN
+            half = self.options.bits // 2
+            inside = ("x = llrint(u / GRAIN)",
+                      f"(PRODUCTS(>> {half}) + (PRODUCTS(& {2**half - 1}) >> {half})) >> {half}",
+                      "(real)(y * GRAIN)")  # fmt: skip
         gains = [f"{float(g)!r}{suffix}" for g in (self.Kv, self.Kp, self.share, self.rate)]
         return f"""/* {title}: position, velocity and filters of a drive,
    one call each period{self._often}.
@@ -122,6 +126,8 @@ class Program:
 #include <string.h>
 
 #define GRAIN {self.options.grain!r}
+#define PRODUCTS(part) ((c[0] part) * x + (c[1] part) * s[0] + (c[2] part) * s[1] \\
+    - (c[3] part) * s[2] - (c[4] part) * s[3])
 typedef {real} real;
 typedef {number} number;
 typedef struct {{
@@ -137,8 +143,7 @@ static const number FILTERS[{max(count, 1)}][5] = {{
 static real filtered(const number *c, number *s, real u)
 {{
     number {inside[0]};
-    number y = c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3];
-    {inside[1]};
+    number y = {inside[1]};
     s[1] = s[0]; s[0] = x; s[3] = s[2]; s[2] = y;
     return {inside[2]};
 }}
