@@ -225,7 +225,8 @@ def actuator_starts(
     """
     draws, (low, high) = draws_for_each * count, crossovers_of
     parts = []
-    for i, own in enumerate(structure.structures):
+    for i in structure.free:
+        own = structure.structures[i]
         family = _seen_by(structure, plants[0], i, sampling)
         single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
         crossovers = np.exp(rng.uniform(np.log(low), np.log(high), draws))

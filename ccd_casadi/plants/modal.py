@@ -327,11 +327,11 @@ def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()
     if not wrong.size:
         return bool(undamped.any())
     i = wrong[0]
-    words = "is not damped" if damping[i] >= -least else "has a negative damping"
-    raise PlantError(
-        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: the loop does not reach it; "
-        "return a damping matrix that reaches it, or damping_ratio, such as 0.005"
-    )
+    words = "is not damped: the loop does not reach it; return a damping matrix that reaches it"
+    if damping[i] < -least:
+        words = "has a negative damping; correct the damping, or A"
+    where = f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz"
+    raise PlantError(f"{where} {words}, or return damping_ratio, such as 0.005")
 
 
 def _aligned(modes: Array, lam: Array, C: Array, equal: float) -> Array:

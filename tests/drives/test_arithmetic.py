@@ -109,9 +109,11 @@ def test_the_C_code_is_the_program_to_the_bit(name: str, slower: int, tmp_path: 
     loaded.cascade_step.restype, loaded.cascade_step.argtypes = real, [ctypes.c_void_p, *[real] * 3]
     state = ctypes.create_string_buffer(4096)
     loaded.cascade_reset.argtypes = [ctypes.c_void_p]
-    loaded.cascade_reset(state)
-    found = [loaded.cascade_step(state, *map(float, row)) for row in signals().tolist()]
-    assert found == [float(u) for u in own.run(*signals().T)]
+    for size in (1.0, 5e4):  # of 300 N, and of 15 MN
+        loaded.cascade_reset(state)
+        given = size * signals()
+        found = [loaded.cascade_step(state, *map(float, row)) for row in given.tolist()]
+        assert found == [float(u) for u in own.run(*given.T)]
 
 
 def test_the_program_answers_as_its_state_space() -> None:

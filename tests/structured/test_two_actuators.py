@@ -61,6 +61,15 @@ def start(sampling: Sampling | None) -> np.ndarray:
     return found[0]
 
 
+def test_a_channel_like_another_adds_no_parameters_to_a_start() -> None:
+    """It has those of its owner; a rotor's second plane like its first ended in a traceback."""
+    alike = replace(STRUCTURE, structures=STRUCTURE.structures[1:] * 2, owners=(0, 0))
+    plants = [one_sensor()]
+    whole = composite_problem(plants, alike, BOUNDS, FAST)
+    found = actuator_starts(whole, alike, plants, FAST, 1, np.random.default_rng(0))
+    assert [len(kappa) for kappa in found] == [len(alike.names)]
+
+
 @pytest.mark.parametrize("sampling", [None, FAST])
 def test_derivatives_of_gains_of_1_by_2_plants(sampling: Sampling | None) -> None:
     kappa = start(sampling)

@@ -54,5 +54,5 @@ def test_a_loop_damps_what_it_reaches() -> None:
     hidden.K[:] = np.diag([1.0, 2.0])
     with pytest.raises(PlantError, match="is not damped: the loop does not reach it"):
         require_damping(modal_plant(hidden, FREE))
-    with pytest.raises(PlantError, match="has a negative damping"):
+    with pytest.raises(PlantError, match="has a negative damping; correct the damping, or A"):
         require_damping(modal_plant(two_masses(-0.01), FREE))

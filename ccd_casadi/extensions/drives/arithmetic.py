@@ -6,9 +6,9 @@ controller wants, and the acceleration times the mass to the PI's force:
     v = F_s (Kv e + f (r_k - r_{k-1})/T),   u = F_c (PI(v - v_m) + m (r_k - 2r_{k-1} + r_{k-2})/T²)
 
 With f = 1 and m the rigid mass the error falls with the jerk no more: what the delays leave follows
-the fourth derivative. Gains and the PI compute in the drive's floating point; a
-fixed-point filter takes and gives integers of `grain` N, its products summed in 64 bits and shifted
-right by 30, towards minus infinity.
+the fourth derivative. Gains and the PI compute in the drive's floating point; a fixed-point filter
+takes and gives integers of `grain` N, its exact sum of products shifted right by 30, towards minus
+infinity; the C does so in 64 bits by halves of the coefficients.
 """
 
 from collections.abc import Callable
@@ -140,8 +140,12 @@ class Program:
 
         rows = [f"    {{{', '.join(map(value, own))}}}" for own in (*self.setpoint, *self.current)]
         count, n = len(rows), len(self.setpoint)
-        inside = ("x = llrint(u / GRAIN)", f"y >>= {self.options.bits}", "(real)(y * GRAIN)") \
-            if self._fixed else ("x = u", "", "y")  # fmt: skip
+        inside = ("x = u", "c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3]", "y")
+        if self._fixed:  # of a whole product 64 bits hold no more than 8 kN
+            half = self.options.bits // 2
+            inside = ("x = llrint(u / GRAIN)",
+                      f"(PRODUCTS(>> {half}) + (PRODUCTS(& {2**half - 1}) >> {half})) >> {half}",
+                      "(real)(y * GRAIN)")  # fmt: skip
         gains = [
             f"{float(g)!r}{suffix}"
             for g in (self.Kv, self.Kp, self.share, self.rate, self.ahead, self.push)
@@ -154,6 +158,8 @@ class Program:
 #include <string.h>
 
 #define GRAIN {self.options.grain!r}
+#define PRODUCTS(part) ((c[0] part) * x + (c[1] part) * s[0] + (c[2] part) * s[1] \\
+    - (c[3] part) * s[2] - (c[4] part) * s[3])
 typedef {real} real;
 typedef {number} number;
 typedef struct {{
@@ -169,8 +175,7 @@ static const number FILTERS[{max(count, 1)}][5] = {{
 static real filtered(const number *c, number *s, real u)
 {{
     number {inside[0]};
-    number y = c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3];
-    {inside[1]};
+    number y = {inside[1]};
     s[1] = s[0]; s[0] = x; s[3] = s[2]; s[2] = y;
     return {inside[2]};
 }}
