@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
 from ccd_casadi.analysis.loop_channels import LoopChannel
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -143,11 +143,15 @@ def realised(K: StateSpace) -> Realisation:
 
 
 def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
-    """K with A block-diagonal, and the sizes of its blocks."""
+    """K with A block-diagonal, and the sizes of its blocks.
+
+    From balanced coordinates: a Schur form errs by eps ‖A‖, which moves light poles of a large A.
+    """
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
-    A, T, sizes = _decoupled(K.A)
-    B, C = np.asarray(np.linalg.solve(T, K.B), float), K.C @ T
+    A, B, C = balanced(K.A, K.B, K.C)
+    A, T, sizes = _decoupled(A)
+    B, C = np.asarray(np.linalg.solve(T, B), float), C @ T
     start = 0
     for size in sizes:
         states = slice(start, start + size)
