@@ -141,8 +141,12 @@ def main(options: argparse.Namespace) -> ExitCode:
                 (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = with_verdict_line(finished, folder, deployed_line(finished, found, moved))
-    inform(_summary(finished, found, moved))
+    line = deployed_line(finished, found, moved)
+    finished = with_verdict_line(finished, folder, line)
+    # a folder elsewhere leaves the run as it is, but the decision here is on what was deployed
+    verdict = finished.result.get("verdict")
+    known = {"verdict": {**verdict, line.name: line.entry}} if isinstance(verdict, dict) else {}
+    inform(_summary(finished, found, moved, {**finished.result, **known}))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words
     from ccd_casadi.reporting.run_verdict import index_of, publish
@@ -161,7 +165,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     return ExitCode.NOT_VERIFIED
 
 
-def _summary(run: "FinishedRun", found: "Deployment", moved: "OnHardware | None") -> str:
+def _summary(
+    run: "FinishedRun", found: "Deployment", moved: "OnHardware | None", judged: dict[str, Any]
+) -> str:
     from ccd_casadi.deployment.integer_loop import integer_words
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
@@ -169,7 +175,7 @@ def _summary(run: "FinishedRun", found: "Deployment", moved: "OnHardware | None"
     from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(
-        d=found, status=status_words(run, found), decision=advice(run.result),
+        d=found, status=status_words(run, found), decision=advice(judged),
         needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
         integers=integer_words(found.realisation.fixed, found.rounding, moved),
     ).rstrip()  # fmt: skip
