@@ -21,6 +21,7 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
+from ccd_casadi.lti.frequency_grid import local_maxima, zoomed
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -287,10 +288,19 @@ def moved_by_forces(
     for plant in plants:
         sensed, drive, counted = split(plant, cascade)
         loop = Loop(sensed, K, sampling, drive=drive, counted=counted)
-        omega = loop.grid() if loop.stable else np.zeros(0)
-        omega = np.append(omega, min(cascade.stiff_below, np.pi / sampling.period * 0.999))
+        if not loop.stable:
+            found.append(np.inf)
+            continue
+
+        def gain(omega: Array, loop: Loop = loop) -> Array:
+            return np.asarray(np.abs(loop.moved(omega.ravel())).max((1, 2)).reshape(omega.shape))
+
+        omega = np.append(loop.grid(), min(cascade.stiff_below, np.pi / sampling.period * 0.999))
         omega = omega[(omega >= lowest) & (omega <= cascade.stiff_below)]
-        found.append(float(np.abs(loop.moved(omega)).max()) if loop.stable else np.inf)
+        values = gain(omega)
+        top = local_maxima(values)
+        tops = zoomed(gain, omega[top - 1], omega[top + 1])[1]
+        found.append(float(np.append(tops, values).max()))
     return np.array(found)
 
 
