@@ -27,13 +27,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.extensions.schedule.segments import Segment, within
+from ccd_casadi.extensions.schedule.segments import Segment
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
+from ccd_casadi.support.arrays import Array, states
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class CrossingOptions:
     Attributes
     ----------
     positions : int
-        At which the plant's matrices are evaluated.
+        At which the plant's matrices are evaluated; linear between them.
     slowest : float
         Time over the range of the first rate, in periods of the least ω_b; then halved.
     trials : int
@@ -52,13 +52,16 @@ class CrossingOptions:
         Positions at rest to compare with.
     rise : float
         Of the largest motion, over that at rest, which a rate that is allowed does not exceed.
+    longest : int
+        Periods of the way at one rate that are simulated at most.
     """
 
-    positions: int = 100
+    positions: int = 401
     slowest: float = 160.0
     trials: int = 7
     rests: int = 9
     rise: float = 1.25
+    longest: int = 400_000
 
 
 @dataclass(frozen=True)
@@ -113,17 +116,89 @@ def part_at(segments: Sequence[Segment], now: int, p: float) -> int:
     return int(np.argmax(depths))
 
 
-def rates_tried(
+@dataclass(frozen=True)
+class Way:
+    """The loop along the range, its sampled plant linear between places.
+
+    Attributes
+    ----------
+    segments, K : sequence of Segment, of StateSpace
+        The parts, and K(z) of each.
+    places : array (N,)
+        Evenly over the range.
+    plants : sequence of StateSpace
+        At these, sampled.
+    """
+
+    segments: Sequence[Segment]
+    K: Sequence[StateSpace]
+    places: Array
+    plants: Sequence[StateSpace]
+
+    @np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
+    def errors(self, way: Array, force: Array) -> Array:
+        """The largest |y| of each step along p = way (k,) under a force (k, m) at the actuators."""
+        A, B, C = (np.array([getattr(one, part) for one in self.plants]) for part in "ABC")
+        onwards, found = handovers(self.K), np.zeros(len(way))
+        share = (way - self.places[0]) / (self.places[-1] - self.places[0]) * (len(A) - 1)
+        left = np.minimum(share.astype(int), len(A) - 2)
+        x, now = np.zeros(A.shape[1]), part_at(self.segments, 0, float(way[0]))
+        z = np.zeros(len(self.K[now].A))
+        for k, (i, p) in enumerate(zip(left.tolist(), way.tolist(), strict=True)):
+            t = share[k] - i
+            e = -((C[i] + t * (C[i + 1] - C[i])) @ x)
+            found[k] = np.abs(e).max()
+            part = part_at(self.segments, now, p)
+            if part != now:
+                now, z = part, onwards[now, part] @ z
+            own = self.K[now]
+            u = own.C @ z + own.D @ e + force[k]
+            z = own.A @ z + own.B @ e
+            x = A[i] @ x + B[i] @ u + t * ((A[i + 1] - A[i]) @ x + (B[i + 1] - B[i]) @ u)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def at_rest(self, force: Array, rests: int) -> float:
+        """The largest |y| of the loops at rest at some of the places, under the same force."""
+        most = 0.0
+        for i in np.linspace(0, len(self.places) - 1, rests).astype(int).tolist():
+            part = part_at(self.segments, 0, float(self.places[i]))
+            loop = closed_loop(self.plants[i], self.K[part])
+            most = max(most, np.abs(states(loop.A, force @ loop.B_d.T) @ loop.C_y.T).max())
+        return float(most)
+
+
+def sampled_plants(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, positions: Sequence[float]
+) -> list[StateSpace]:
+    """The model at positions of p, sampled, in the states of its own matrices."""
+    sampling = structured_of(problem).sampling
+    assert sampling is not None
+    own = uncertain_plant(problem, theta)
+    row = np.array(own.names) == f"theta.{name}"
+    plants = own.as_written([(0, np.where(row, p, own.nominal)) for p in positions])
+    return [sampled(plant, sampling.period, sampling.delay) for plant in plants]
+
+
+def way_of(
     problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
-    *, seed: int = 0, options: CrossingOptions = CrossingOptions(),
-) -> list[RateTrial]:  # fmt: skip
+    options: CrossingOptions = CrossingOptions(),
+) -> Way:  # fmt: skip
+    """The loop of a schedule along its range."""
+    sampling = structured_of(problem).sampling
+    assert sampling is not None
+    places = np.linspace(segments[0].low, segments[-1].high, options.positions)
+    plants = sampled_plants(problem, theta, name, places.tolist())
+    return Way(segments, controllers_of(segments, sampling), places, plants)
+
+
+def rates_tried(
+    way: Way, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
+) -> list[RateTrial]:
     """Simulate the way over the whole range at rising rates, until the motion rises too much.
 
     Parameters
     ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-        Of a sampled loop.
+    way : Way
     seed : int
         Of the force.
     options : CrossingOptions
@@ -133,56 +208,48 @@ def rates_tried(
     list of RateTrial
         The last may exceed `options.rise`.
     """
-    sampling = structured_of(problem).sampling
-    assert sampling is not None
-    low, high = segments[0].low, segments[-1].high
-    places = np.linspace(low, high, options.positions)
-    plants = []
-    for p in places.tolist():
-        own = uncertain_plant(within(problem, name, p, p), theta)
-        (plant,) = own.as_written([(0, own.nominal)])
-        plants.append(sampled(plant, sampling.period, sampling.delay))
-    K = controllers_of(segments, sampling)
-    rng = np.random.default_rng(seed)
-    slowest = min(one.design.bandwidth for one in segments) / (2.0 * np.pi)
-    longest = int(np.ceil(options.slowest / slowest / sampling.period))
-    force = rng.standard_normal((longest, K[0].C.shape[0]))
-
-    def largest(way: Array) -> float:
-        return _simulated(segments, plants, K, places, way, force)
-
-    rest = max(largest(np.full(longest, p)) for p in np.linspace(low, high, options.rests))
+    low, high = way.places[0], way.places[-1]
+    period = way.plants[0].period
+    slowest = min(one.design.bandwidth for one in way.segments) / (2.0 * np.pi)
+    longest = int(np.ceil(options.slowest / slowest / period))
+    force = np.random.default_rng(seed).standard_normal((longest, way.K[0].C.shape[0]))
+    rest = way.at_rest(force, options.rests)
     found = []
     for trial in range(options.trials):
         steps = longest // 2**trial
         to_and_fro = np.abs(np.arange(longest) / steps % 2.0 - 1.0)  # as long as at rest
-        rise = largest(high - (high - low) * to_and_fro) / rest
-        found.append(RateTrial((high - low) / (steps * sampling.period), rise))
+        rise = float(way.errors(high - (high - low) * to_and_fro, force).max()) / rest
+        found.append(RateTrial(float(high - low) / (steps * period), rise))
         if not rise <= options.rise:
             break
     return found
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
-def _simulated(
-    segments: Sequence[Segment], plants: Sequence[StateSpace], K: Sequence[StateSpace],
-    places: Array, way: Array, force: Array,
-) -> float:  # fmt: skip
-    """The largest |y| along p(t) = way under a force at the actuators; infinite: it diverged."""
-    onwards = handovers(K)
-    x, most = np.zeros(len(plants[0].A)), 0.0
-    now = part_at(segments, 0, float(way[0]))
-    z = np.zeros(len(K[now].A))
-    spot = np.abs(places - way[:, None]).argmin(axis=1)
-    for k in range(len(way)):
-        G = plants[spot[k]]
-        e = -(G.C @ x)
-        most = max(most, float(np.abs(e).max()))
-        part = part_at(segments, now, float(way[k]))
-        if part != now:
-            now, z = part, onwards[now, part] @ z
-        own = K[now]
-        u = own.C @ z + own.D @ e
-        z = own.A @ z + own.B @ e
-        x = G.A @ x + G.B @ (u + force[k])
-    return most if np.isfinite(x).all() and np.isfinite(most) else np.inf
+def crossed(
+    way: Way, rate: float, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
+) -> tuple[float, float] | None:
+    """Simulate the way at one rate: forth under a random force, back without.
+
+    Parameters
+    ----------
+    way : Way
+    rate : float
+        Unit of p per second.
+    seed, options : int, CrossingOptions
+
+    Returns
+    -------
+    rise, left : float
+        The largest motion over that at rest, and of it what the last tenth of the way has; None:
+        the way takes more than `options.longest` steps.
+    """
+    low, high = way.places[0], way.places[-1]
+    if not rate * way.plants[0].period * options.longest >= 2.0 * (high - low):
+        return None
+    steps = int(np.ceil((high - low) / (rate * way.plants[0].period)))
+    force = np.random.default_rng(seed).standard_normal((2 * steps, way.K[0].C.shape[0]))
+    force[steps:] = 0.0
+    p = high - (high - low) * np.abs(np.arange(2 * steps) / steps - 1.0)
+    motion = way.errors(p, force)
+    most = float(motion.max())
+    return most / way.at_rest(force, options.rests), float(motion[-steps // 5 :].max()) / most

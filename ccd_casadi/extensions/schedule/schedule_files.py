@@ -18,6 +18,7 @@ from ccd_casadi.extensions.schedule.handover import (
     controllers_of,
     handovers,
 )
+from ccd_casadi.extensions.schedule.rate_bound import RateBound
 from ccd_casadi.extensions.schedule.segments import Alone, ScheduleOptions, Segment, refined, within
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -71,6 +72,9 @@ class Schedule:
         ω_b of one controller for all of the range, rad/s.
     frozen : tuple of FrozenPosition
     rates : tuple of RateTrial
+    bound : RateBound
+    crossed : (float, float), optional
+        Rise and rest of the motion at this bound, as simulated.
     """
 
     name: str
@@ -80,6 +84,8 @@ class Schedule:
     whole: float
     frozen: tuple[FrozenPosition, ...]
     rates: tuple[RateTrial, ...]
+    bound: RateBound
+    crossed: tuple[float, float] | None
 
     @property
     def verified(self) -> bool:
@@ -97,6 +103,26 @@ class Schedule:
         """The highest rate of the simulation that is allowed; 0: none."""
         kept = [one.rate for one in self.rates if one.rise <= CrossingOptions().rise]
         return max(kept, default=0.0)
+
+    @property
+    def of_bound(self) -> str:
+        """The rate at which V falls, what sets it, and what the simulation has there."""
+        bound, unit = self.bound, self.unit or "–"
+        if not bound.rate:
+            return "V falls at no rate: part {bound.part + 1} is bounded by no P that is tried"
+        at = f"part {bound.part + 1}" if bound.at is None else f"the handover at {bound.at:.4g}"
+        words = (
+            f"{bound.rate:.3g} {unit}/s by a Lyapunov function at {bound.positions} positions of "
+            f"each part, not proven between them; {at} sets it; a part is held for "
+            f"{max(bound.waits):.3g} s before a return"
+        )
+        if self.crossed is None:
+            return f"{words}; too slow to simulate"
+        rise, left = self.crossed
+        return (
+            f"{words}; simulated forth and back: the largest motion is {rise:.3g} of that at rest, "
+            f"{left:.1g} of it is left"
+        )
 
     @property
     def least_share(self) -> float:
@@ -202,6 +228,8 @@ def entry(found: Schedule) -> dict[str, Any]:
         "least_bandwidth_hz": min(one.bandwidth for one in found.frozen) / HZ,
         "proven_parts": found.proven,
         "rates": [vars(one) for one in found.rates], "allowed_rate": found.allowed,
+        "rate_bound": vars(found.bound) | dict(zip(
+            ("simulated_rise", "simulated_left"), found.crossed or (None, None), strict=True)),
     })  # fmt: skip
 
 
@@ -220,6 +248,7 @@ def summary(found: Schedule) -> list[str]:
         ("rate", f"up to {found.allowed:.3g}{unit}/s: the largest motion rises by "
          f"{100.0 * (CrossingOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
          if found.allowed else "none of the simulated rates keeps the loop quiet"),
+        ("bound", found.of_bound),
     ]  # fmt: skip
     return [f"{name:14s}{words}" for name, words in rows]
 
@@ -243,6 +272,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
         "status": "verified" if found.verified else "NOT verified",
         "period": literal(sampling.period), "rate": f"{sampling.rate_hz:.10g}",
         "delay": f"{sampling.delay:.10g}", "allowed": f"{found.allowed:.3g}",
+        "bound": f"{found.bound.rate:.3g}", "wait": f"{max(found.bound.waits):.3g}",
         "n": len(K[0].A), "p": K[0].B.shape[1], "m": len(K[0].C),
         "low": literals(np.array([one.low for one in found.segments]), 4),
         "high": literals(np.array([one.high for one in found.segments]), 4),
@@ -316,10 +346,12 @@ def _rates(found: Schedule, unit: str) -> c.Figure:
         f"rate of {found.name} ({unit}/s)", "largest motion, over that at rest (–)",
         (c.Curve(np.array([one.rate for one in shown]), np.array([one.rise for one in shown]),
                  marker="o"),),
-        levels=(c.Level(CrossingOptions().rise, "allowed"),), log_x=True,
+        levels=(c.Level(CrossingOptions().rise, "allowed"),
+                *([c.Level(found.bound.rate, "bound", vertical=True)] if found.bound.rate else [])),
+        log_x=True,
     )  # fmt: skip
     words = (
         f"{found.name} moves to and fro at a constant rate under a random force; simulated, not "
-        "proven. Forces of that motion itself are not in it."
+        f"proven. Forces of that motion itself are not in it. Allowed rate: {found.of_bound}."
     )
     return c.Figure(c.Lines(((panel,),), "Rates", (2.8,)), words)
