@@ -66,10 +66,14 @@ class CrossingOptions:
 
 @dataclass(frozen=True)
 class RateTrial:
-    """A rate of p (its unit/s) and the rise of the motion; infinite: it diverged."""
+    """A rate of p (its unit/s), the rise of the motion, and its share that is left in the end.
+
+    That is the last tenth of a time of which the second half has no force; infinite: it diverged.
+    """
 
     rate: float
     rise: float
+    left: float
 
 
 def controllers_of(segments: Sequence[Segment], sampling: Sampling) -> list[StateSpace]:
@@ -134,6 +138,10 @@ class Way:
     K: Sequence[StateSpace]
     places: Array
     plants: Sequence[StateSpace]
+
+    def longest(self, options: CrossingOptions) -> float:
+        """Time over the range at the first rate, s."""
+        return options.slowest * 2.0 * np.pi / min(one.design.bandwidth for one in self.segments)
 
     @np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
     def errors(self, way: Array, force: Array) -> Array:
@@ -208,27 +216,19 @@ def rates_tried(
     list of RateTrial
         The last may exceed `options.rise`.
     """
-    low, high = way.places[0], way.places[-1]
-    period = way.plants[0].period
-    slowest = min(one.design.bandwidth for one in way.segments) / (2.0 * np.pi)
-    longest = int(np.ceil(options.slowest / slowest / period))
-    force = np.random.default_rng(seed).standard_normal((longest, way.K[0].C.shape[0]))
-    rest = way.at_rest(force, options.rests)
-    found = []
-    for trial in range(options.trials):
-        steps = longest // 2**trial
-        to_and_fro = np.abs(np.arange(longest) / steps % 2.0 - 1.0)  # as long as at rest
-        rise = float(way.errors(high - (high - low) * to_and_fro, force).max()) / rest
-        found.append(RateTrial(float(high - low) / (steps * period), rise))
-        if not rise <= options.rise:
+    rate, found = float(np.ptp(way.places)) / way.longest(options), []
+    for _ in range(options.trials):
+        found.append(crossed(way, rate, seed=seed, options=options))
+        if not found[-1].rise <= options.rise:
             break
+        rate *= 2.0
     return found
 
 
 def crossed(
     way: Way, rate: float, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
-) -> tuple[float, float] | None:
-    """Simulate the way at one rate: forth under a random force, back without.
+) -> RateTrial:
+    """Simulate the way at one rate, to and fro: half the time under a random force, then without.
 
     Parameters
     ----------
@@ -239,17 +239,17 @@ def crossed(
 
     Returns
     -------
-    rise, left : float
-        The largest motion over that at rest, and of it what the last tenth of the way has; None:
-        the way takes more than `options.longest` steps.
+    RateTrial
+        NaN: the way takes more than `options.longest` periods.
     """
-    low, high = way.places[0], way.places[-1]
-    if not rate * way.plants[0].period * options.longest >= 2.0 * (high - low):
-        return None
-    steps = int(np.ceil((high - low) / (rate * way.plants[0].period)))
-    force = np.random.default_rng(seed).standard_normal((2 * steps, way.K[0].C.shape[0]))
-    force[steps:] = 0.0
-    p = high - (high - low) * np.abs(np.arange(2 * steps) / steps - 1.0)
-    motion = way.errors(p, force)
+    period, width = way.plants[0].period, float(np.ptp(way.places))
+    if not rate * period * options.longest >= 2.0 * width:
+        return RateTrial(rate, np.nan, np.nan)
+    half = int(np.ceil(max(way.longest(options), width / rate) / period))
+    force = np.random.default_rng(seed).standard_normal((2 * half, way.K[0].C.shape[0]))
+    force[half:] = 0.0
+    to_and_fro = np.abs(np.arange(2 * half) * (rate * period / width) % 2.0 - 1.0)
+    motion = way.errors(way.places[-1] - width * to_and_fro, force)
     most = float(motion.max())
-    return most / way.at_rest(force, options.rests), float(motion[-steps // 5 :].max()) / most
+    rise = most / way.at_rest(force, options.rests)
+    return RateTrial(rate, rise, float(motion[-half // 5 :].max()) / most)

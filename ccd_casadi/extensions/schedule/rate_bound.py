@@ -1,25 +1,30 @@
-"""How fast p may change: a bound by a Lyapunov function that moves with p (Desoer 1969).
+"""How fast p may change: a Lyapunov function that moves with p (after Desoer 1969).
 
-In a part the sampled loop is x⁺ = A(p) x, with x of the plant as written and of the controller.
-V = xᵀP(p)x, P linear between N positions, decays by m per second at every rate |dp/dt| <= r where
+In a part the sampled loop is x⁺ = A(p) x, x of the plant as written and of the controller. Its
+modes are in two groups: slow ones, such as an integrator's, and the rest. With Y(p), rows for both
+groups, linear between N positions, n = (|Y_s x|, |Y_f x|) has in a step with |p' - p| <= r T
 
-    A(p)ᵀP(p') A(p) <= exp(-m T) P(p)      at the positions, for all |p' - p| <= r T.
+    n⁺ <= N n,    N_ab = max over p, p' of |Y_a(p') A(p) Y⁻¹_b(p)|,
 
-P is of the modes X of A, P = X⁻ᴴX⁻¹, or solves Stein's equation for A/σ, σ = ρ(A)ˢ, s < 1: (A/σ)ᵀ
-P(A/σ) - P = -Q; the kind that allows the highest rate is taken. A handover, x⁺ = E x, multiplies V
-by at most μ = λ_max(EᵀP₂E, P₁); a part that is held for ln μ/m before has made up for it. Over
-the range, forth and back, a part is held for its way between two handovers over r: the highest r
-for which that is long enough is the allowed rate. Who turns back sooner waits for ln μ/m.
+and at a handover, x⁺ = E x, n⁺ <= B n with B_ab = |Y_a E Y⁻¹_b| of both parts. V = w n, w > 0 of
+each part, falls at each step where wN < w, and from handover to handover where w'BNᵏ < w over the k
+periods in between. The highest r for which some w have both, over the range forth and back, is the
+allowed rate. Who turns back sooner waits: a part keeps control as long as crossing it takes at r.
+
+At each position a group's Y is R Z: Z projects on the group, in the modes of one position of the
+part, and RᴴR = P solves (F/σ)ᴴP(F/σ) - P = -Q, σ = ρ(F)ˢ, of the group's F = Z A Z⁻¹. Q is such
+that P = 1 at that position for s = 0. On loops of examples/gantry_stroke one group of all modes
+allows 0.02 m/s, as V waits for the integrator; Q = 1 in states of even scales 0.04 m/s inside a
+part alone; and P of each position's own modes 0.02 to 3 m/s there, as two poles meet in some parts.
 
 A(p) between the positions is not covered, nor are plants off the model, nor forces of p's motion.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from scipy.linalg import eigh, solve_discrete_lyapunov
+from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from ccd_casadi.extensions.schedule.handover import (
     controllers_of,
@@ -42,91 +47,72 @@ class RateBoundOptions:
     ----------
     positions : int
         N of each part.
-    shares : tuple of float
-        s: decay of A/σ that is left out, over the loop's own.
     halvings : int
         Of the interval of rates.
+    share : float
+        s.
+    decades, weights : float, int
+        To each side of 1 and count of w_f/w_s.
     """
 
     positions: int = 101
-    shares: tuple[float, ...] = (0.5, 0.8, 0.95)
-    halvings: int = 30
+    halvings: int = 18
+    share: float = 0.8
+    decades: float = 4.0
+    weights: int = 65
 
 
 @dataclass(frozen=True)
-class Decay:
-    """V of a part.
-
-    Attributes
-    ----------
-    loops, P : arrays (N, n, n)
-        A and P at the positions.
-    fastest : float
-        One position each period: no rate above is examined (unit of p per second).
-    period : float
-        T, s.
-    """
+class Modes:
+    """Of a part: A and Y at its positions (N, n, n), and how many modes are slow."""
 
     loops: Array
-    P: Array
-    fastest: float
-    period: float
+    Y: np.ndarray
+    slow: int
 
-    @cached_property
-    def _seen(self) -> tuple[Array, Array, float]:
-        """AᵀPA at each position and its change to each neighbour, where P = 1; λ_max at rest."""
-        k = np.arange(len(self.P))
+    def norms(self, parts: np.ndarray, other: int) -> Array:
+        """The largest norm of each block (2, 2) of matrices that lead to `other` slow modes."""
+        rows, columns = ((slice(k), slice(k, None)) for k in (other, self.slow))
+        return np.array([[np.linalg.norm(parts[:, a, b], 2, axis=(1, 2)).max() for b in columns]
+                         for a in rows])  # fmt: skip
+
+    def step(self, share: float) -> Array:
+        """N where p moves by this share of the distance of positions in a period, or less."""
+        k = np.arange(len(self.Y))
         at, to = np.append(k[:-1], k[1:]), np.append(k[1:], k[:-1])
-        onto = self.loops[at] @ np.linalg.inv(np.linalg.cholesky(self.P)).mT[at]
-        rest, moved = (onto.mT @ P @ onto for P in (self.P[at], self.P[to] - self.P[at]))
-        return rest, moved, float(np.linalg.eigvalsh(rest)[:, -1].max())
-
-    def at(self, rate: float) -> float:
-        """m, 1/s: V decays by it at least, at every rate up to this one; negative: V may rise."""
-        rest, moved, most = self._seen  # λ_max is convex in the rate: its ends are examined
-        worst = np.linalg.eigvalsh(rest + rate / self.fastest * moved)[:, -1].max()
-        return -float(np.log(max(worst, most))) / self.period
+        onto = self.loops[at] @ np.linalg.inv(self.Y)[at]
+        moved = share * (self.Y[to] - self.Y[at]) @ onto
+        rest = self.Y[at] @ onto  # a norm is convex in the share: its ends are examined
+        return self.norms(np.concatenate([rest, rest + moved]), self.slow)
 
 
-def lyapunov_functions(
-    loops: Array, options: RateBoundOptions = RateBoundOptions()
-) -> dict[str, Array]:
-    """P of each kind at the positions of a part: `modes`, and `decay s` of Stein's equation.
-
-    Parameters
-    ----------
-    loops : array (N, n, n)
-        A(p), each stable, in states of even scales.
-    options : RateBoundOptions
-
-    Returns
-    -------
-    dict of str to array (N, n, n)
-    """
+def modes_of(loops: Array, options: RateBoundOptions = RateBoundOptions()) -> Modes:
+    """Y of a part: its groups are apart where neighbouring decays are, in the mean of p."""
     values, X = np.linalg.eig(loops)
+    order = np.argsort(-np.abs(values), axis=1)
+    values = np.take_along_axis(values, order, axis=1)
+    X = np.take_along_axis(X, order[:, None], axis=2)
     Y = np.linalg.inv(X)
-    Y = Y * np.sqrt(np.linalg.norm(X, axis=1) / np.linalg.norm(Y, axis=2))[..., None]
-    found = {"modes": (Y.conj().mT @ Y).real}
-    for share in options.shares:
-        sigma = np.abs(values).max(axis=1) ** share
-        found[f"decay {share:g}"] = np.array([
-            solve_discrete_lyapunov(A.T / s, np.eye(len(A)))
-            for A, s in zip(loops, sigma.tolist(), strict=True)
-        ])  # fmt: skip
-    return {kind: 0.5 * (P + P.mT) for kind, P in found.items()}
+    slow = int(np.argmax(np.diff(np.log(-np.log(np.abs(values))), axis=1).mean(axis=0))) + 1
+    best = int(np.argmin(np.linalg.cond(X)))
+    size = np.sqrt(np.linalg.norm(X[best], axis=0) / np.linalg.norm(Y[best], axis=1))
+    first, back, found = size[:, None] * Y[best], X[best] / size, []
+    for A, x, y in zip(loops, X, Y, strict=True):
+        rows = []
+        for own in (slice(slow), slice(slow, None)):
+            onto = first[own] @ x[:, own] @ y[own]  # analytic in p, through double poles too
+            part = onto @ A @ back[:, own] @ np.linalg.inv(onto @ back[:, own])
+            sigma = np.abs(np.linalg.eigvals(part)).max() ** options.share
+            Q = np.diag(1.0 - np.abs(values[best, own]) ** 2)
+            P = solve_discrete_lyapunov(part.conj().T / sigma, Q)
+            rows.append(np.linalg.cholesky(P).conj().T @ onto)
+        found.append(np.vstack(rows))
+    return Modes(loops, np.array(found), slow)
 
 
 @dataclass(frozen=True)
 class Border:
-    """A handover at p = `at` from part `first` to part `then`.
-
-    Attributes
-    ----------
-    first, then : int
-        From 0.
-    at, way : float
-        p there, and how far p has moved in the first part since it took over.
-    """
+    """A handover at p = `at` between two parts; p has moved by `way` since the one before."""
 
     first: int
     then: int
@@ -138,20 +124,14 @@ def borders(segments: Sequence[Segment]) -> list[Border]:
     """The handovers of the way over the whole range, forth and back."""
     low, high = segments[0].low, segments[-1].high
     now, found = 0, []
-    while segments[now].high < high:
-        at = segments[now].high
-        then = part_at(segments, now, float(np.nextafter(at, np.inf)))
-        found.append((now, then, at, at - low))
-        now = then
-    while segments[now].low > low:
-        at = segments[now].low
-        then = part_at(segments, now, float(np.nextafter(at, -np.inf)))
-        found.append((now, then, at, 2.0 * high - low - at))
-        now = then
-    moved = np.array([s for *_, s in found])
+    for up, end in ((True, high), (False, low)):
+        while (at := segments[now].high if up else segments[now].low) != end:
+            then = part_at(segments, now, float(np.nextafter(at, np.inf if up else -np.inf)))
+            found.append((now, then, at, at - low if up else 2.0 * high - low - at))
+            now = then
+    moved = np.array([far for *_, far in found])
     ways = np.diff(moved, prepend=moved[-1:] - 2.0 * (high - low))
-    return [Border(first, then, at, float(way))
-            for (first, then, at, _), way in zip(found, ways, strict=True)]  # fmt: skip
+    return [Border(*one[:3], float(way)) for one, way in zip(found, ways, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -162,18 +142,15 @@ class RateBound:
     ----------
     rate : float
         r, unit of p per second; 0: none.
-    kind, positions : str, int
-        Of P; N.
-    part : int
-        That sets it, from 0.
-    at : float or None
-        The handover that sets it; None: V stops falling inside the part.
+    positions : int
+        N.
+    part, at : int, float or None
+        That set it: the part, from 0, and where it hands over; None: V stops falling inside.
     waits : tuple of float
-        ln μ/m of each part at this rate, s: from one handover to the next at least.
+        Of each part, s: it keeps control for so long at least.
     """
 
     rate: float
-    kind: str
     positions: int
     part: int
     at: float | None
@@ -200,83 +177,60 @@ def rate_bound(
     Returns
     -------
     RateBound
-        The best of the kinds of P.
     """
-    way = borders(segments)
-    steps = [(one.high - one.low) / (len(A) - 1) / period
-             for one, A in zip(segments, loops, strict=True)]  # fmt: skip
-    every = [lyapunov_functions(A, options) for A in loops]
-    found = []
-    for kind in every[0]:
-        decays = [Decay(A, own[kind], step, period)
-                  for A, own, step in zip(loops, every, steps, strict=True)]  # fmt: skip
-        found.append(_highest(decays, way, _jumps(decays, way, E, segments), kind, options))
-    return max(found, key=lambda one: one.rate)
-
-
-def _jumps(
-    decays: Sequence[Decay], way: Sequence[Border], E: Array, segments: Sequence[Segment]
-) -> Array:
-    """ln μ of each border, P scaled so that it is alike for both directions."""
-    found, rows = [], np.zeros((len(way), len(decays)))
-    for row, border in zip(rows, way, strict=True):
-        first, then = border.first, border.then
-        row[first], row[then] = -1.0, 1.0
-        before = decays[first].P[-1 if border.at == segments[first].high else 0]
-        own, P, onto = segments[then], decays[then].P, E[first, then]
-        k = (border.at - own.low) / (own.high - own.low) * (len(P) - 1)
-        found.append(max(
-            eigh(onto.T @ after @ onto, before, eigvals_only=True)[-1]
-            for after in P[int(k) : int(k) + 2]
-        ))  # fmt: skip
-    jumps = np.log(np.maximum(found, 1e-300))
-    # of all scales the mean square of ln mu is least: alike to both sides where there are two
-    return jumps - rows @ np.linalg.lstsq(rows, jumps)[0]
-
-
-def _highest(
-    decays: Sequence[Decay], way: Sequence[Border], jumps: Array, kind: str,
-    options: RateBoundOptions,
-) -> RateBound:  # fmt: skip
-    def fails(rate: float) -> tuple[int, float | None] | None:
-        falls = [decay.at(rate) for decay in decays]
-        if min(falls) <= 0.0:
-            return int(np.argmin(falls)), None
-        late = [rate * jump - falls[border.first] * border.way
-                for border, jump in zip(way, jumps.tolist(), strict=True)]  # fmt: skip
-        k = int(np.argmax([0.0, *late]))
-        return (way[k - 1].first, way[k - 1].at) if k else None
-
-    low, high = 0.0, min(decay.fastest for decay in decays)
-    part, at = int(np.argmin([decay.fastest for decay in decays])), None
+    parts, way = [modes_of(A) for A in loops], borders(segments)
+    fastest = [(one.high - one.low) / (len(A) - 1) / period
+               for one, A in zip(segments, loops, strict=True)]  # fmt: skip
+    jumps = [_jump(parts, one, E[one.first, one.then], segments) for one in way]
+    rows = np.array([[(one.then == i) - (one.first == i) for i in range(len(parts))]
+                     for one in way], float).reshape(-1, len(parts))  # fmt: skip
+    # |n| of each part in a unit of its own, which shares a growth between two directions
+    sizes = np.log([np.diagonal(B) for B in jumps]).reshape(-1, 2)
+    units = np.exp(-np.linalg.lstsq(rows, sizes)[0])
+    ratios = np.geomspace(10.0**-options.decades, 10.0**options.decades, options.weights)
+    w = units[:, None] * np.stack([np.ones(len(ratios)), ratios], axis=1)
+    what = [*((i, None) for i in range(len(parts))), *((one.first, one.at) for one in way)]
+    low, high, sets = 0.0, min(fastest), what[int(np.argmin(fastest))]
     for _ in range(options.halvings):
         rate = 0.5 * (low + high)
-        failed = fails(rate)
-        if failed is None:
+        N = [part.step(rate / most) for part, most in zip(parts, fastest, strict=True)]
+        rises = [(v @ own / v).max(axis=1) for v, own in zip(w, N, strict=True)]
+        for one, B in zip(way, jumps, strict=True):
+            held = np.linalg.matrix_power(N[one.first], int(one.way / (rate * period)))
+            rises.append((w[one.then] @ B @ held / w[one.first]).max(axis=1))
+        whole = np.array(rises)
+        best = whole[:, whole.max(axis=0).argmin()]
+        if best.max() < 1.0:
             low = rate
         else:
-            high, (part, at) = rate, failed
-    waits = np.zeros(len(decays))
-    for border, jump in zip(way, jumps.tolist(), strict=True):
-        waits[border.first] = max(waits[border.first], jump / decays[border.first].at(low))
-    return RateBound(low, kind, len(decays[0].P), part, at, tuple(waits.tolist()))
+            high, sets = rate, what[int(best.argmax())]
+    waits = [max((one.way / low if low else np.inf for one in way if one.first == i), default=0.0)
+             for i in range(len(parts))]  # fmt: skip
+    return RateBound(low, len(loops[0]), *sets, tuple(waits))
+
+
+def _jump(parts: Sequence[Modes], one: Border, E: Array, segments: Sequence[Segment]) -> Array:
+    """B of a handover."""
+    before, after, own = parts[one.first], parts[one.then], segments[one.then]
+    k = int((one.at - own.low) / (own.high - own.low) * (len(after.Y) - 1))
+    onto = E @ np.linalg.inv(before.Y[-1 if one.at == segments[one.first].high else 0])
+    return before.norms(after.Y[k : k + 2] @ onto, after.slow)
 
 
 def rate_bound_of(
     problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
     options: RateBoundOptions = RateBoundOptions(),
 ) -> RateBound:  # fmt: skip
-    """`rate_bound` of a schedule, for the model, in states of even scales."""
+    """`rate_bound` of a schedule's model, in states of even scales."""
     sampling = structured_of(problem).sampling
     assert sampling is not None
-    K, loops, scales = controllers_of(segments, sampling), [], np.empty(0)
+    K, loops = controllers_of(segments, sampling), []
     for one, own in zip(segments, K, strict=True):
         places = np.linspace(one.low, one.high, options.positions).tolist()
-        closed = [closed_loop(G, own) for G in sampled_plants(problem, theta, name, places)]
-        if not len(scales):
-            scales = state_scales(closed[0].A, closed[0].B_d, closed[0].C_y)
-        loops.append(np.array([loop.A for loop in closed]) * scales / scales[:, None])
-    onwards = handovers(K)
-    E = np.broadcast_to(np.eye(len(scales)), (len(K), len(K), len(scales), len(scales))).copy()
-    E[..., -onwards.shape[-1] :, -onwards.shape[-1] :] = onwards
-    return rate_bound(loops, E * scales / scales[:, None], segments, sampling.period, options)
+        loops.append([closed_loop(G, own) for G in sampled_plants(problem, theta, name, places)])
+    first = loops[0][0]
+    t = state_scales(first.A, first.B_d, first.C_y)
+    plant = np.eye(len(t) - len(K[0].A))
+    E = np.array([[block_diag(plant, T) for T in row] for row in handovers(K)])
+    scaled = [np.array([loop.A for loop in part]) * t / t[:, None] for part in loops]
+    return rate_bound(scaled, E * t / t[:, None], segments, sampling.period, options)

@@ -73,8 +73,8 @@ class Schedule:
     frozen : tuple of FrozenPosition
     rates : tuple of RateTrial
     bound : RateBound
-    crossed : (float, float), optional
-        Rise and rest of the motion at this bound, as simulated.
+    crossed : RateTrial
+        The simulation at this bound.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Schedule:
     frozen: tuple[FrozenPosition, ...]
     rates: tuple[RateTrial, ...]
     bound: RateBound
-    crossed: tuple[float, float] | None
+    crossed: RateTrial
 
     @property
     def verified(self) -> bool:
@@ -109,19 +109,18 @@ class Schedule:
         """The rate at which V falls, what sets it, and what the simulation has there."""
         bound, unit = self.bound, self.unit or "–"
         if not bound.rate:
-            return "V falls at no rate: part {bound.part + 1} is bounded by no P that is tried"
+            return f"no rate is bounded: V does not fall in part {bound.part + 1}"
         at = f"part {bound.part + 1}" if bound.at is None else f"the handover at {bound.at:.4g}"
         words = (
             f"{bound.rate:.3g} {unit}/s by a Lyapunov function at {bound.positions} positions of "
-            f"each part, not proven between them; {at} sets it; a part is held for "
-            f"{max(bound.waits):.3g} s before a return"
+            f"each part, not proven between; {at} sets it; turn back {max(bound.waits):.3g} s after"
+            " a handover or later"
         )
-        if self.crossed is None:
+        if np.isnan(self.crossed.rise):
             return f"{words}; too slow to simulate"
-        rise, left = self.crossed
         return (
-            f"{words}; simulated forth and back: the largest motion is {rise:.3g} of that at rest, "
-            f"{left:.1g} of it is left"
+            f"{words}; simulated: largest motion {self.crossed.rise:.3g} times that at rest, "
+            f"{self.crossed.left:.1g} of it left after the way back without a force"
         )
 
     @property
@@ -228,8 +227,7 @@ def entry(found: Schedule) -> dict[str, Any]:
         "least_bandwidth_hz": min(one.bandwidth for one in found.frozen) / HZ,
         "proven_parts": found.proven,
         "rates": [vars(one) for one in found.rates], "allowed_rate": found.allowed,
-        "rate_bound": vars(found.bound) | dict(zip(
-            ("simulated_rise", "simulated_left"), found.crossed or (None, None), strict=True)),
+        "rate_bound": vars(found.bound) | {"simulated": vars(found.crossed)},
     })  # fmt: skip
 
 
