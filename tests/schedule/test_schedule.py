@@ -72,8 +72,10 @@ def test_the_code_hands_over_as_the_simulation_does(tmp_path: Path) -> None:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler here")
-    found = Schedule("at", "m", tuple(PARTS), (Alone(0.5, 100.0),), 90.0, (), (),
-                     RateBound(0.0, 101, 0, None, (np.inf,) * 3), RateTrial(0.0, np.nan, np.nan))  # fmt: skip
+    bound, crossed = RateBound(0.0, 101, 0, None, (np.inf,) * 3), RateTrial(0.0, np.nan, np.nan)
+    found = Schedule(
+        "at", "m", tuple(PARTS), (Alone(0.5, 100.0),), 90.0, (), (), bound, crossed
+    )  # fmt: skip
     write_code(tmp_path, found, SAMPLING)
     assert "NOT verified" in (tmp_path / "schedule.h").read_text()  # no rate was tried
     warnings = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off"]

@@ -22,6 +22,7 @@ A(p) between the positions is not covered, nor are plants off the model, nor for
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_lyapunov
@@ -35,7 +36,7 @@ from ccd_casadi.extensions.schedule.handover import (
 from ccd_casadi.extensions.schedule.segments import Segment
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.lti.state_space import closed_loop, state_scales
+from ccd_casadi.lti.state_space import closed_loop, sigma_max, state_scales
 from ccd_casadi.support.arrays import Array
 
 
@@ -73,17 +74,21 @@ class Modes:
     def norms(self, parts: np.ndarray, other: int) -> Array:
         """The largest norm of each block (2, 2) of matrices that lead to `other` slow modes."""
         rows, columns = ((slice(k), slice(k, None)) for k in (other, self.slow))
-        return np.array([[np.linalg.norm(parts[:, a, b], 2, axis=(1, 2)).max() for b in columns]
-                         for a in rows])  # fmt: skip
+        return np.array([[sigma_max(parts[:, a, b]).max() for b in columns] for a in rows])
 
-    def step(self, share: float) -> Array:
-        """N where p moves by this share of the distance of positions in a period, or less."""
+    @cached_property
+    def _seen(self) -> tuple[np.ndarray, np.ndarray, Array]:
+        """Y A Y⁻¹ at each position, its change with Y to each neighbour, and N at rest."""
         k = np.arange(len(self.Y))
         at, to = np.append(k[:-1], k[1:]), np.append(k[1:], k[:-1])
         onto = self.loops[at] @ np.linalg.inv(self.Y)[at]
-        moved = share * (self.Y[to] - self.Y[at]) @ onto
-        rest = self.Y[at] @ onto  # a norm is convex in the share: its ends are examined
-        return self.norms(np.concatenate([rest, rest + moved]), self.slow)
+        rest = self.Y[at] @ onto
+        return rest, (self.Y[to] - self.Y[at]) @ onto, self.norms(rest, self.slow)
+
+    def step(self, share: float) -> Array:
+        """N where p moves by this share of the distance of positions in a period, or less."""
+        rest, moved, least = self._seen  # a norm is convex in the share: its ends are examined
+        return np.maximum(least, self.norms(rest + share * moved, self.slow))
 
 
 def modes_of(loops: Array, options: RateBoundOptions = RateBoundOptions()) -> Modes:
