@@ -86,19 +86,9 @@ def controllers_of(segments: Sequence[Segment], sampling: Sampling) -> list[Stat
 
 
 def handovers(K: Sequence[StateSpace], *, resting: float = 1e-7) -> Array:
-    """The state of a part from that of another.
+    """The state of a part from that of another: (parts, parts, n, n) of the K(z) of each part.
 
-    Parameters
-    ----------
-    K : sequence of StateSpace
-        K(z) of every part, of one structure.
-    resting : float
-        |z - 1| of a pole of an integrator.
-
-    Returns
-    -------
-    (parts, parts, n, n) array
-        x of the second from x of the first.
+    |z - 1| of an integrator's pole is at most `resting`.
     """
     kept, moves, forces, one = [], [], [], np.eye(len(K[0].A))
     for own in K:
@@ -202,20 +192,7 @@ def way_of(
 def rates_tried(
     way: Way, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
 ) -> list[RateTrial]:
-    """Simulate the way over the whole range at rising rates, until the motion rises too much.
-
-    Parameters
-    ----------
-    way : Way
-    seed : int
-        Of the force.
-    options : CrossingOptions
-
-    Returns
-    -------
-    list of RateTrial
-        The last may exceed `options.rise`.
-    """
+    """Simulate the way over the whole range at rising rates, until the motion rises too much."""
     rate, found = float(np.ptp(way.places)) / way.longest(options), []
     for _ in range(options.trials):
         found.append(crossed(way, rate, seed=seed, options=options))
@@ -230,17 +207,7 @@ def crossed(
 ) -> RateTrial:
     """Simulate the way at one rate, to and fro: half the time under a random force, then without.
 
-    Parameters
-    ----------
-    way : Way
-    rate : float
-        Unit of p per second.
-    seed, options : int, CrossingOptions
-
-    Returns
-    -------
-    RateTrial
-        NaN: the way takes more than `options.longest` periods.
+    NaN: the way takes more than `options.longest` periods.
     """
     period, width = way.plants[0].period, float(np.ptp(way.places))
     if not rate * period * options.longest >= 2.0 * width:

@@ -168,20 +168,8 @@ def rate_bound(
 ) -> RateBound:  # fmt: skip
     """The highest rate of p at which V falls over the range, forth and back.
 
-    Parameters
-    ----------
-    loops : sequence of array (N, n, n)
-        A of each part at positions evenly from its low to its high end.
-    E : array (parts, parts, n, n)
-        x of the second part from x of the first.
-    segments : sequence of Segment
-    period : float
-        T, s.
-    options : RateBoundOptions
-
-    Returns
-    -------
-    RateBound
+    `loops` has A of each part (N, n, n), evenly from its low to its high end, `E` x of the second
+    part from x of the first (parts, parts, n, n), `period` T in s.
     """
     parts, way = [modes_of(A) for A in loops], borders(segments)
     fastest = [(one.high - one.low) / (len(A) - 1) / period

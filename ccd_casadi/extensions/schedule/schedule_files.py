@@ -137,25 +137,15 @@ def frozen_positions(
     problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
     positions: Sequence[float],
 ) -> list[FrozenPosition]:  # fmt: skip
-    """Judge every part where it may control, on the model and the corners of its set there.
-
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-    positions : sequence of float
-
-    Returns
-    -------
-    list of FrozenPosition
-    """
+    """Judge every part where it may control, on the model and the corners of its set there."""
     sampling, bounds = structured_of(problem).sampling, bounds_of(problem)
     assert sampling is not None
     K, integrator = controllers_of(segments, sampling), structure_of(problem).integrator
-    found = []
+    found, own = [], uncertain_plant(problem, theta)
+    at = own.names.index(f"theta.{name}")
+    corners = uncertain_plant(within(problem, name, positions[0], positions[0]), theta).corners()
     for p in positions:
-        own = uncertain_plant(within(problem, name, p, p), theta)
-        plants = own.as_written(own.corners())
+        plants = own.as_written([(option, np.insert(one, at, p)) for option, one in corners])
         failed, bandwidth = [], np.inf
         for i, (one, coded) in enumerate(zip(segments, K, strict=True)):
             if not one.low <= p <= one.high:
@@ -177,20 +167,8 @@ def kept_at_positions(
 ) -> tuple[list[Segment], list[FrozenPosition]]:  # fmt: skip
     """Judge the parts at positions; where one exceeds a bound, design it anew and judge at others.
 
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-    count : int
-        Positions, evenly over the range; after a new design between those before.
-    workers, tell : Pool, callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of Segment
-    list of FrozenPosition
-        Of the parts that are returned.
+    These are even over the range, `count` of them; after a new design those between. What is
+    returned are the parts in the end, with their positions.
     """
     segments, places = list(segments), np.linspace(segments[0].low, segments[-1].high, count)
     for turn in range(options.refinements + 1):
@@ -252,14 +230,7 @@ def summary(found: Schedule) -> list[str]:
 
 
 def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
-    """Write schedule.h and schedule.c.
-
-    Parameters
-    ----------
-    folder : Path
-    found : Schedule
-    sampling : Sampling
-    """
+    """Write schedule.h and schedule.c."""
     K = controllers_of(found.segments, sampling)
 
     def joined(parts: Sequence[Array]) -> str:
@@ -283,17 +254,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
 
 
 def schedule_page(title: str, found: Schedule) -> c.Page:
-    """Make report.html.
-
-    Parameters
-    ----------
-    title : str
-    found : Schedule
-
-    Returns
-    -------
-    Page
-    """
+    """Make report.html."""
     kept = sum(one.passed for one in found.frozen)
     lead = (
         f"{len(found.segments)} controllers of the same sections, one for each part of "

@@ -97,22 +97,10 @@ class Alone:
 
 
 def scheduled_name(problem: CoDesignProblem, name: str | None) -> str:
-    """The parameter that a schedule is over.
+    """The parameter that a schedule is over: left out, the only one that varies.
 
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    name : str, optional
-        Left out, the only one that varies.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    UserError
-        None varies, or several do and none is named; or the controller is of another kind.
+    Raises a UserError where none varies, where several do and none is named, and for a controller
+    of another kind.
     """
     if not isinstance(problem.controller, StructuredProblem):
         raise UserError('schedule: needs controller.structure = "sections"')
@@ -174,25 +162,9 @@ def segments_of(
 ) -> tuple[list[Segment], list[Alone], float]:  # fmt: skip
     """Halve the range until every part has its share of what its positions have alone.
 
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-        The hardware, and the parameter that is measured.
-    workers, tell : Pool, callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of Segment
-        Ascending, each judged and, where it can be, proven.
-    list of Alone
-    float
-        ω_b of one controller for the whole range, rad/s.
-
-    Raises
-    ------
-    UserError
-        No controller keeps every bound on the whole range.
+    Returns the parts, ascending, each judged and where it can be proven; the positions alone; and
+    ω_b of one controller for the whole range, rad/s. Where none keeps every bound on it, it is a
+    UserError.
     """
     problem = with_range(replace(problem, start=tuple(theta)))  # one range of K for every part
     low, high = next((a, b) for own, a, b in structured_of(problem).uncertainty.ranges
@@ -223,19 +195,7 @@ def halved(
 ) -> list[DesignedPart]:  # fmt: skip
     """Halve the part with the least share, until each has the required one, or there are enough.
 
-    Parameters
-    ----------
-    whole : DesignedPart
-    alone : sequence of Alone
-    search : callable
-        (low, high, a design that keeps every bound there) -> DesignedPart.
-    tell : callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of DesignedPart
-        Ascending.
+    `search` designs for (low, high, a design that keeps every bound there); ascending.
     """
     parts = [whole]
     while len(parts) < options.most:
@@ -269,18 +229,7 @@ def refined(
 ) -> Segment:  # fmt: skip
     """Design a part anew from its own controller, with the plants at some positions in its set.
 
-    Parameters
-    ----------
-    segment : Segment
-    theta, name : sequence of float, str
-    positions : sequence of float
-        At which it exceeds a bound.
-    workers, tell : Pool, callable
-
-    Returns
-    -------
-    Segment
-        Judged again; the same where no controller keeps the wider set.
+    It is judged again; the same is returned where no controller keeps the wider set.
     """
     own = uncertain_plant(segment.problem, theta)
     row = np.arange(len(own.names)) == own.names.index(f"theta.{name}")
