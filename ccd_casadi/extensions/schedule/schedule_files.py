@@ -180,7 +180,9 @@ def kept_at_positions(
         for i in late:
             own = [one.at for one in found if i in one.failed]
             tell(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
-            segments[i] = refined(segments[i], theta, name, own, workers=workers, tell=tell)
+            segments[i] = refined(
+                segments[i], theta, name, own, workers=workers, tell=tell, options=options
+            )
         between = 0.5 * (places[1:] + places[:-1])
         places = np.concatenate([places[:1], between, places[-1:]])  # the ends are corners
     return segments, found

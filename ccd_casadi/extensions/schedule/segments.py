@@ -29,8 +29,9 @@ from ccd_casadi.inner_problem.structured_problem import (
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared, search_starts, with_range
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import counted
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class ScheduleOptions:
         At which a controller for that position alone is searched, evenly over the range.
     refinements : int
         Times at most that positions at which a part exceeds a bound join its design.
+    boxes : int
+        Enclosures of the proof of a part at most: some two minutes.
     """
 
     share: float = 0.9
@@ -56,6 +59,7 @@ class ScheduleOptions:
     overlap: float = 0.05
     positions: int = 5
     refinements: int = 3
+    boxes: int = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -186,7 +190,7 @@ def segments_of(
         words = f"no controller for the whole range to begin with: {whole.design.words}"
         raise UserError(f"schedule: {words}")
     parts = halved(whole, alone, search, tell, options)
-    return _judged(parts, theta, tell, workers), alone, whole.design.bandwidth
+    return _judged(parts, theta, tell, workers, options.boxes), alone, whole.design.bandwidth
 
 
 def halved(
@@ -225,7 +229,7 @@ def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
 
 def refined(
     segment: Segment, theta: Sequence[float], name: str, positions: Sequence[float], *,
-    workers: Pool, tell: Tell = silent,
+    workers: Pool, tell: Tell = silent, options: ScheduleOptions = ScheduleOptions(),
 ) -> Segment:  # fmt: skip
     """Design a part anew from its own controller, with the plants at some positions in its set.
 
@@ -244,18 +248,18 @@ def refined(
     if not made.certified:
         return segment
     part = DesignedPart(segment.low, segment.high, problem, made)
-    return _judged([part], theta, tell, workers)[0]
+    return _judged([part], theta, tell, workers, options.boxes)[0]
 
 
 def _judged(
-    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool
+    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool, boxes: int
 ) -> list[Segment]:
-    found = []
-    for i, part in enumerate(parts, 1):
-        tell(f"judge and proof of part {i} of {len(parts)}")
-        on_box = DesignOnBox(part.problem, tuple(theta), part.design)
-        worst = on_box.worst(workers=workers)[0]
-        wide, checked, proof = on_box.judged(worst, workers)
-        judgement = judgement_of(wide, checked)
-        found.append(Segment(**vars(part), judgement=judgement, proof=proof))
+    """Judge and prove every part; the proofs are spread over the workers."""
+    tell(f"judge and proof of {counted(len(parts), 'part')}")
+    on_boxes = [DesignOnBox(part.problem, tuple(theta), part.design) for part in parts]
+    tasks = {i: (one, None, boxes) for i, one in enumerate(on_boxes)}
+    proofs, found = dict(results(workers, DesignOnBox.proof, tasks)), []
+    for i, (part, on_box) in enumerate(zip(parts, on_boxes, strict=True)):
+        judgement = judgement_of(*on_box.on_lattice(on_box.worst(workers=workers)[0], workers))
+        found.append(Segment(**vars(part), judgement=judgement, proof=proofs[i]))
     return found
