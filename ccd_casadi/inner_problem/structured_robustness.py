@@ -228,14 +228,14 @@ class DesignOnBox:
             for one in found
         ]  # fmt: skip
 
-    def proof(self, workers: Pool | None = None) -> "Proof":
-        """Branch and bound over the whole box."""
+    def proof(self, workers: Pool | None = None, most_boxes: int | None = None) -> "Proof":
+        """Branch and bound over the whole box, by `most_boxes` enclosures at most."""
         from ccd_casadi.fixed_structure.box_proof import prove
 
         design, problem = self.design, self.problem
         return prove(
             self.uncertain, design.structure, design.kappa, design.bandwidth, bounds_of(problem),
-            problem.sampling, workers=workers,
+            problem.sampling, workers=workers, most_boxes=most_boxes,
         )  # fmt: skip
 
     def judged(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":

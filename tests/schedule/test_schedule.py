@@ -15,7 +15,8 @@ from oracles.case_documents import QUICK_SECTIONS
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.extensions.schedule.handover import controllers_of, handovers, part_at
+from ccd_casadi.extensions.schedule.handover import RateTrial, controllers_of, handovers, part_at
+from ccd_casadi.extensions.schedule.rate_bound import RateBound
 from ccd_casadi.extensions.schedule.schedule_command import main
 from ccd_casadi.extensions.schedule.schedule_files import Schedule, write_code
 from ccd_casadi.extensions.schedule.segments import (
@@ -71,7 +72,10 @@ def test_the_code_hands_over_as_the_simulation_does(tmp_path: Path) -> None:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler here")
-    found = Schedule("at", "m", tuple(PARTS), (Alone(0.5, 100.0),), 90.0, (), ())
+    bound, crossed = RateBound(0.0, 101, 0, None, (np.inf,) * 3), RateTrial(0.0, np.nan, np.nan)
+    found = Schedule(
+        "at", "m", tuple(PARTS), (Alone(0.5, 100.0),), 90.0, (), (), bound, crossed
+    )  # fmt: skip
     write_code(tmp_path, found, SAMPLING)
     assert "NOT verified" in (tmp_path / "schedule.h").read_text()  # no rate was tried
     warnings = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off"]
@@ -173,5 +177,7 @@ def test_the_command_designs_parts_that_keep_every_bound(tmp_path: Path) -> None
     assert min(part["bandwidth_hz"] for part in found["parts"]) >= whole * (1.0 - 1e-6)
     assert found["positions_kept"] == 5
     assert found["allowed_rate"] > 0.0
+    assert found["rate_bound"]["rate"] > 0.0
+    assert found["rate_bound"]["simulated"]["left"] < 0.1
     assert (out / "report.html").exists()
     assert (out / "schedule.c").exists()

@@ -27,13 +27,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.extensions.schedule.segments import Segment, within
+from ccd_casadi.extensions.schedule.segments import Segment
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
+from ccd_casadi.support.arrays import Array, states
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class CrossingOptions:
     Attributes
     ----------
     positions : int
-        At which the plant's matrices are evaluated.
+        At which the plant's matrices are evaluated; linear between them.
     slowest : float
         Time over the range of the first rate, in periods of the least ω_b; then halved.
     trials : int
@@ -52,21 +52,28 @@ class CrossingOptions:
         Positions at rest to compare with.
     rise : float
         Of the largest motion, over that at rest, which a rate that is allowed does not exceed.
+    longest : int
+        Periods of the way at one rate that are simulated at most.
     """
 
-    positions: int = 100
+    positions: int = 401
     slowest: float = 160.0
     trials: int = 7
     rests: int = 9
     rise: float = 1.25
+    longest: int = 400_000
 
 
 @dataclass(frozen=True)
 class RateTrial:
-    """A rate of p (its unit/s) and the rise of the motion; infinite: it diverged."""
+    """A rate of p (its unit/s), the rise of the motion, and its share that is left in the end.
+
+    That is the last tenth of a time of which the second half has no force; infinite: it diverged.
+    """
 
     rate: float
     rise: float
+    left: float
 
 
 def controllers_of(segments: Sequence[Segment], sampling: Sampling) -> list[StateSpace]:
@@ -79,19 +86,9 @@ def controllers_of(segments: Sequence[Segment], sampling: Sampling) -> list[Stat
 
 
 def handovers(K: Sequence[StateSpace], *, resting: float = 1e-7) -> Array:
-    """The state of a part from that of another.
+    """The state of a part from that of another: (parts, parts, n, n) of the K(z) of each part.
 
-    Parameters
-    ----------
-    K : sequence of StateSpace
-        K(z) of every part, of one structure.
-    resting : float
-        |z - 1| of a pole of an integrator.
-
-    Returns
-    -------
-    (parts, parts, n, n) array
-        x of the second from x of the first.
+    |z - 1| of an integrator's pole is at most `resting`.
     """
     kept, moves, forces, one = [], [], [], np.eye(len(K[0].A))
     for own in K:
@@ -113,76 +110,113 @@ def part_at(segments: Sequence[Segment], now: int, p: float) -> int:
     return int(np.argmax(depths))
 
 
-def rates_tried(
-    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
-    *, seed: int = 0, options: CrossingOptions = CrossingOptions(),
-) -> list[RateTrial]:  # fmt: skip
-    """Simulate the way over the whole range at rising rates, until the motion rises too much.
+@dataclass(frozen=True)
+class Way:
+    """The loop along the range, its sampled plant linear between places.
 
-    Parameters
+    Attributes
     ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-        Of a sampled loop.
-    seed : int
-        Of the force.
-    options : CrossingOptions
-
-    Returns
-    -------
-    list of RateTrial
-        The last may exceed `options.rise`.
+    segments, K : sequence of Segment, of StateSpace
+        The parts, and K(z) of each.
+    places : array (N,)
+        Evenly over the range.
+    plants : sequence of StateSpace
+        At these, sampled.
     """
+
+    segments: Sequence[Segment]
+    K: Sequence[StateSpace]
+    places: Array
+    plants: Sequence[StateSpace]
+
+    def longest(self, options: CrossingOptions) -> float:
+        """Time over the range at the first rate, s."""
+        return options.slowest * 2.0 * np.pi / min(one.design.bandwidth for one in self.segments)
+
+    @np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
+    def errors(self, way: Array, force: Array) -> Array:
+        """The largest |y| of each step along p = way (k,) under a force (k, m) at the actuators."""
+        A, B, C = (np.array([getattr(one, part) for one in self.plants]) for part in "ABC")
+        onwards, found = handovers(self.K), np.zeros(len(way))
+        share = (way - self.places[0]) / (self.places[-1] - self.places[0]) * (len(A) - 1)
+        left = np.minimum(share.astype(int), len(A) - 2)
+        x, now = np.zeros(A.shape[1]), part_at(self.segments, 0, float(way[0]))
+        z = np.zeros(len(self.K[now].A))
+        for k, (i, p) in enumerate(zip(left.tolist(), way.tolist(), strict=True)):
+            t = share[k] - i
+            e = -((C[i] + t * (C[i + 1] - C[i])) @ x)
+            found[k] = np.abs(e).max()
+            part = part_at(self.segments, now, p)
+            if part != now:
+                now, z = part, onwards[now, part] @ z
+            own = self.K[now]
+            u = own.C @ z + own.D @ e + force[k]
+            z = own.A @ z + own.B @ e
+            x = A[i] @ x + B[i] @ u + t * ((A[i + 1] - A[i]) @ x + (B[i + 1] - B[i]) @ u)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def at_rest(self, force: Array, rests: int) -> float:
+        """The largest |y| of the loops at rest at some of the places, under the same force."""
+        most = 0.0
+        for i in np.linspace(0, len(self.places) - 1, rests).astype(int).tolist():
+            part = part_at(self.segments, 0, float(self.places[i]))
+            loop = closed_loop(self.plants[i], self.K[part])
+            most = max(most, np.abs(states(loop.A, force @ loop.B_d.T) @ loop.C_y.T).max())
+        return float(most)
+
+
+def sampled_plants(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, positions: Sequence[float]
+) -> list[StateSpace]:
+    """The model at positions of p, sampled, in the states of its own matrices."""
     sampling = structured_of(problem).sampling
     assert sampling is not None
-    low, high = segments[0].low, segments[-1].high
-    places = np.linspace(low, high, options.positions)
-    plants = []
-    for p in places.tolist():
-        own = uncertain_plant(within(problem, name, p, p), theta)
-        (plant,) = own.as_written([(0, own.nominal)])
-        plants.append(sampled(plant, sampling.period, sampling.delay))
-    K = controllers_of(segments, sampling)
-    rng = np.random.default_rng(seed)
-    slowest = min(one.design.bandwidth for one in segments) / (2.0 * np.pi)
-    longest = int(np.ceil(options.slowest / slowest / sampling.period))
-    force = rng.standard_normal((longest, K[0].C.shape[0]))
+    own = uncertain_plant(problem, theta)
+    row = np.array(own.names) == f"theta.{name}"
+    plants = own.as_written([(0, np.where(row, p, own.nominal)) for p in positions])
+    return [sampled(plant, sampling.period, sampling.delay) for plant in plants]
 
-    def largest(way: Array) -> float:
-        return _simulated(segments, plants, K, places, way, force)
 
-    rest = max(largest(np.full(longest, p)) for p in np.linspace(low, high, options.rests))
-    found = []
-    for trial in range(options.trials):
-        steps = longest // 2**trial
-        to_and_fro = np.abs(np.arange(longest) / steps % 2.0 - 1.0)  # as long as at rest
-        rise = largest(high - (high - low) * to_and_fro) / rest
-        found.append(RateTrial((high - low) / (steps * sampling.period), rise))
-        if not rise <= options.rise:
+def way_of(
+    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
+    options: CrossingOptions = CrossingOptions(),
+) -> Way:  # fmt: skip
+    """The loop of a schedule along its range."""
+    sampling = structured_of(problem).sampling
+    assert sampling is not None
+    places = np.linspace(segments[0].low, segments[-1].high, options.positions)
+    plants = sampled_plants(problem, theta, name, places.tolist())
+    return Way(segments, controllers_of(segments, sampling), places, plants)
+
+
+def rates_tried(
+    way: Way, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
+) -> list[RateTrial]:
+    """Simulate the way over the whole range at rising rates, until the motion rises too much."""
+    rate, found = float(np.ptp(way.places)) / way.longest(options), []
+    for _ in range(options.trials):
+        found.append(crossed(way, rate, seed=seed, options=options))
+        if not found[-1].rise <= options.rise:
             break
+        rate *= 2.0
     return found
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a loop that is lost leaves double precision
-def _simulated(
-    segments: Sequence[Segment], plants: Sequence[StateSpace], K: Sequence[StateSpace],
-    places: Array, way: Array, force: Array,
-) -> float:  # fmt: skip
-    """The largest |y| along p(t) = way under a force at the actuators; infinite: it diverged."""
-    onwards = handovers(K)
-    x, most = np.zeros(len(plants[0].A)), 0.0
-    now = part_at(segments, 0, float(way[0]))
-    z = np.zeros(len(K[now].A))
-    spot = np.abs(places - way[:, None]).argmin(axis=1)
-    for k in range(len(way)):
-        G = plants[spot[k]]
-        e = -(G.C @ x)
-        most = max(most, float(np.abs(e).max()))
-        part = part_at(segments, now, float(way[k]))
-        if part != now:
-            now, z = part, onwards[now, part] @ z
-        own = K[now]
-        u = own.C @ z + own.D @ e
-        z = own.A @ z + own.B @ e
-        x = G.A @ x + G.B @ (u + force[k])
-    return most if np.isfinite(x).all() and np.isfinite(most) else np.inf
+def crossed(
+    way: Way, rate: float, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
+) -> RateTrial:
+    """Simulate the way at one rate, to and fro: half the time under a random force, then without.
+
+    NaN: the way takes more than `options.longest` periods.
+    """
+    period, width = way.plants[0].period, float(np.ptp(way.places))
+    if not rate * period * options.longest >= 2.0 * width:
+        return RateTrial(rate, np.nan, np.nan)
+    half = int(np.ceil(max(way.longest(options), width / rate) / period))
+    force = np.random.default_rng(seed).standard_normal((2 * half, way.K[0].C.shape[0]))
+    force[half:] = 0.0
+    to_and_fro = np.abs(np.arange(2 * half) * (rate * period / width) % 2.0 - 1.0)
+    motion = way.errors(way.places[-1] - width * to_and_fro, force)
+    most = float(motion.max())
+    rise = most / way.at_rest(force, options.rests)
+    return RateTrial(rate, rise, float(motion[-half // 5 :].max()) / most)

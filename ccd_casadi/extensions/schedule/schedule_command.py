@@ -28,7 +28,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
-    from ccd_casadi.extensions.schedule.handover import rates_tried
+    from ccd_casadi.extensions.schedule.handover import crossed, rates_tried, way_of
+    from ccd_casadi.extensions.schedule.rate_bound import rate_bound_of
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
         entry,
@@ -62,10 +63,13 @@ def main(options: argparse.Namespace) -> ExitCode:
             problem, theta, name, segments, options.positions, workers=workers, tell=tell
         )
     tell("the way over the range is simulated")
-    rates = rates_tried(problem, theta, name, segments, seed=options.seed)
+    way = way_of(problem, theta, name, segments)
+    rates = rates_tried(way, seed=options.seed)
+    tell("the allowed rate is bounded")
+    bound = rate_bound_of(problem, theta, name, segments)
     found = Schedule(
         name, problem.parameter_units[name], tuple(segments), tuple(alone), whole,
-        tuple(frozen), tuple(rates),
+        tuple(frozen), tuple(rates), bound, crossed(way, bound.rate, seed=options.seed),
     )  # fmt: skip
     answer = entry(found) | {
         "theta": dict(zip(problem.names, theta, strict=True)), "seed": options.seed,

@@ -18,6 +18,7 @@ from ccd_casadi.extensions.schedule.handover import (
     controllers_of,
     handovers,
 )
+from ccd_casadi.extensions.schedule.rate_bound import RateBound
 from ccd_casadi.extensions.schedule.segments import Alone, ScheduleOptions, Segment, refined, within
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -71,6 +72,9 @@ class Schedule:
         ω_b of one controller for all of the range, rad/s.
     frozen : tuple of FrozenPosition
     rates : tuple of RateTrial
+    bound : RateBound
+    crossed : RateTrial
+        The simulation at this bound.
     """
 
     name: str
@@ -80,6 +84,8 @@ class Schedule:
     whole: float
     frozen: tuple[FrozenPosition, ...]
     rates: tuple[RateTrial, ...]
+    bound: RateBound
+    crossed: RateTrial
 
     @property
     def verified(self) -> bool:
@@ -99,6 +105,25 @@ class Schedule:
         return max(kept, default=0.0)
 
     @property
+    def of_bound(self) -> str:
+        """The rate at which V falls, what sets it, and what the simulation has there."""
+        bound, unit = self.bound, self.unit or "–"
+        if not bound.rate:
+            return f"no rate is bounded: V does not fall in part {bound.part + 1}"
+        at = f"part {bound.part + 1}" if bound.at is None else f"the handover at {bound.at:.4g}"
+        words = (
+            f"{bound.rate:.3g} {unit}/s by a Lyapunov function at {bound.positions} positions of "
+            f"each part, not proven between; {at} sets it; turn back {max(bound.waits):.3g} s after"
+            " a handover or later"
+        )
+        if np.isnan(self.crossed.rise):
+            return f"{words}; too slow to simulate"
+        return (
+            f"{words}; simulated: largest motion {self.crossed.rise:.3g} times that at rest, "
+            f"{self.crossed.left:.1g} of it left after the way back without a force"
+        )
+
+    @property
     def least_share(self) -> float:
         """Of ω_b over that of a position alone, the least of the positions of `alone`."""
         places = [one.at for one in self.frozen]
@@ -112,25 +137,15 @@ def frozen_positions(
     problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
     positions: Sequence[float],
 ) -> list[FrozenPosition]:  # fmt: skip
-    """Judge every part where it may control, on the model and the corners of its set there.
-
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-    positions : sequence of float
-
-    Returns
-    -------
-    list of FrozenPosition
-    """
+    """Judge every part where it may control, on the model and the corners of its set there."""
     sampling, bounds = structured_of(problem).sampling, bounds_of(problem)
     assert sampling is not None
     K, integrator = controllers_of(segments, sampling), structure_of(problem).integrator
-    found = []
+    found, own = [], uncertain_plant(problem, theta)
+    at = own.names.index(f"theta.{name}")
+    corners = uncertain_plant(within(problem, name, positions[0], positions[0]), theta).corners()
     for p in positions:
-        own = uncertain_plant(within(problem, name, p, p), theta)
-        plants = own.as_written(own.corners())
+        plants = own.as_written([(option, np.insert(one, at, p)) for option, one in corners])
         failed, bandwidth = [], np.inf
         for i, (one, coded) in enumerate(zip(segments, K, strict=True)):
             if not one.low <= p <= one.high:
@@ -152,20 +167,8 @@ def kept_at_positions(
 ) -> tuple[list[Segment], list[FrozenPosition]]:  # fmt: skip
     """Judge the parts at positions; where one exceeds a bound, design it anew and judge at others.
 
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-    segments : sequence of Segment
-    count : int
-        Positions, evenly over the range; after a new design between those before.
-    workers, tell : Pool, callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of Segment
-    list of FrozenPosition
-        Of the parts that are returned.
+    These are even over the range, `count` of them; after a new design those between. What is
+    returned are the parts in the end, with their positions.
     """
     segments, places = list(segments), np.linspace(segments[0].low, segments[-1].high, count)
     for turn in range(options.refinements + 1):
@@ -177,7 +180,9 @@ def kept_at_positions(
         for i in late:
             own = [one.at for one in found if i in one.failed]
             tell(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
-            segments[i] = refined(segments[i], theta, name, own, workers=workers, tell=tell)
+            segments[i] = refined(
+                segments[i], theta, name, own, workers=workers, tell=tell, options=options
+            )
         between = 0.5 * (places[1:] + places[:-1])
         places = np.concatenate([places[:1], between, places[-1:]])  # the ends are corners
     return segments, found
@@ -202,6 +207,7 @@ def entry(found: Schedule) -> dict[str, Any]:
         "least_bandwidth_hz": min(one.bandwidth for one in found.frozen) / HZ,
         "proven_parts": found.proven,
         "rates": [vars(one) for one in found.rates], "allowed_rate": found.allowed,
+        "rate_bound": vars(found.bound) | {"simulated": vars(found.crossed)},
     })  # fmt: skip
 
 
@@ -220,19 +226,13 @@ def summary(found: Schedule) -> list[str]:
         ("rate", f"up to {found.allowed:.3g}{unit}/s: the largest motion rises by "
          f"{100.0 * (CrossingOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
          if found.allowed else "none of the simulated rates keeps the loop quiet"),
+        ("bound", found.of_bound),
     ]  # fmt: skip
     return [f"{name:14s}{words}" for name, words in rows]
 
 
 def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
-    """Write schedule.h and schedule.c.
-
-    Parameters
-    ----------
-    folder : Path
-    found : Schedule
-    sampling : Sampling
-    """
+    """Write schedule.h and schedule.c."""
     K = controllers_of(found.segments, sampling)
 
     def joined(parts: Sequence[Array]) -> str:
@@ -243,6 +243,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
         "status": "verified" if found.verified else "NOT verified",
         "period": literal(sampling.period), "rate": f"{sampling.rate_hz:.10g}",
         "delay": f"{sampling.delay:.10g}", "allowed": f"{found.allowed:.3g}",
+        "bound": f"{found.bound.rate:.3g}", "wait": f"{max(found.bound.waits):.3g}",
         "n": len(K[0].A), "p": K[0].B.shape[1], "m": len(K[0].C),
         "low": literals(np.array([one.low for one in found.segments]), 4),
         "high": literals(np.array([one.high for one in found.segments]), 4),
@@ -255,17 +256,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
 
 
 def schedule_page(title: str, found: Schedule) -> c.Page:
-    """Make report.html.
-
-    Parameters
-    ----------
-    title : str
-    found : Schedule
-
-    Returns
-    -------
-    Page
-    """
+    """Make report.html."""
     kept = sum(one.passed for one in found.frozen)
     lead = (
         f"{len(found.segments)} controllers of the same sections, one for each part of "
@@ -316,10 +307,12 @@ def _rates(found: Schedule, unit: str) -> c.Figure:
         f"rate of {found.name} ({unit}/s)", "largest motion, over that at rest (–)",
         (c.Curve(np.array([one.rate for one in shown]), np.array([one.rise for one in shown]),
                  marker="o"),),
-        levels=(c.Level(CrossingOptions().rise, "allowed"),), log_x=True,
+        levels=(c.Level(CrossingOptions().rise, "allowed"),
+                *([c.Level(found.bound.rate, "bound", vertical=True)] if found.bound.rate else [])),
+        log_x=True,
     )  # fmt: skip
     words = (
         f"{found.name} moves to and fro at a constant rate under a random force; simulated, not "
-        "proven. Forces of that motion itself are not in it."
+        f"proven. Forces of that motion itself are not in it. Allowed rate: {found.of_bound}."
     )
     return c.Figure(c.Lines(((panel,),), "Rates", (2.8,)), words)

@@ -29,8 +29,9 @@ from ccd_casadi.inner_problem.structured_problem import (
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import prepared, search_starts, with_range
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import counted
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class ScheduleOptions:
         At which a controller for that position alone is searched, evenly over the range.
     refinements : int
         Times at most that positions at which a part exceeds a bound join its design.
+    boxes : int
+        Enclosures of the proof of a part at most: some two minutes.
     """
 
     share: float = 0.9
@@ -56,6 +59,7 @@ class ScheduleOptions:
     overlap: float = 0.05
     positions: int = 5
     refinements: int = 3
+    boxes: int = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -97,22 +101,10 @@ class Alone:
 
 
 def scheduled_name(problem: CoDesignProblem, name: str | None) -> str:
-    """The parameter that a schedule is over.
+    """The parameter that a schedule is over: left out, the only one that varies.
 
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    name : str, optional
-        Left out, the only one that varies.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    UserError
-        None varies, or several do and none is named; or the controller is of another kind.
+    Raises a UserError where none varies, where several do and none is named, and for a controller
+    of another kind.
     """
     if not isinstance(problem.controller, StructuredProblem):
         raise UserError('schedule: needs controller.structure = "sections"')
@@ -174,25 +166,9 @@ def segments_of(
 ) -> tuple[list[Segment], list[Alone], float]:  # fmt: skip
     """Halve the range until every part has its share of what its positions have alone.
 
-    Parameters
-    ----------
-    problem, theta, name : CoDesignProblem, sequence of float, str
-        The hardware, and the parameter that is measured.
-    workers, tell : Pool, callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of Segment
-        Ascending, each judged and, where it can be, proven.
-    list of Alone
-    float
-        ω_b of one controller for the whole range, rad/s.
-
-    Raises
-    ------
-    UserError
-        No controller keeps every bound on the whole range.
+    Returns the parts, ascending, each judged and where it can be proven; the positions alone; and
+    ω_b of one controller for the whole range, rad/s. Where none keeps every bound on it, it is a
+    UserError.
     """
     problem = with_range(replace(problem, start=tuple(theta)))  # one range of K for every part
     low, high = next((a, b) for own, a, b in structured_of(problem).uncertainty.ranges
@@ -214,7 +190,7 @@ def segments_of(
         words = f"no controller for the whole range to begin with: {whole.design.words}"
         raise UserError(f"schedule: {words}")
     parts = halved(whole, alone, search, tell, options)
-    return _judged(parts, theta, tell, workers), alone, whole.design.bandwidth
+    return _judged(parts, theta, tell, workers, options.boxes), alone, whole.design.bandwidth
 
 
 def halved(
@@ -223,19 +199,7 @@ def halved(
 ) -> list[DesignedPart]:  # fmt: skip
     """Halve the part with the least share, until each has the required one, or there are enough.
 
-    Parameters
-    ----------
-    whole : DesignedPart
-    alone : sequence of Alone
-    search : callable
-        (low, high, a design that keeps every bound there) -> DesignedPart.
-    tell : callable
-    options : ScheduleOptions
-
-    Returns
-    -------
-    list of DesignedPart
-        Ascending.
+    `search` designs for (low, high, a design that keeps every bound there); ascending.
     """
     parts = [whole]
     while len(parts) < options.most:
@@ -265,22 +229,11 @@ def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
 
 def refined(
     segment: Segment, theta: Sequence[float], name: str, positions: Sequence[float], *,
-    workers: Pool, tell: Tell = silent,
+    workers: Pool, tell: Tell = silent, options: ScheduleOptions = ScheduleOptions(),
 ) -> Segment:  # fmt: skip
     """Design a part anew from its own controller, with the plants at some positions in its set.
 
-    Parameters
-    ----------
-    segment : Segment
-    theta, name : sequence of float, str
-    positions : sequence of float
-        At which it exceeds a bound.
-    workers, tell : Pool, callable
-
-    Returns
-    -------
-    Segment
-        Judged again; the same where no controller keeps the wider set.
+    It is judged again; the same is returned where no controller keeps the wider set.
     """
     own = uncertain_plant(segment.problem, theta)
     row = np.arange(len(own.names)) == own.names.index(f"theta.{name}")
@@ -295,18 +248,18 @@ def refined(
     if not made.certified:
         return segment
     part = DesignedPart(segment.low, segment.high, problem, made)
-    return _judged([part], theta, tell, workers)[0]
+    return _judged([part], theta, tell, workers, options.boxes)[0]
 
 
 def _judged(
-    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool
+    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool, boxes: int
 ) -> list[Segment]:
-    found = []
-    for i, part in enumerate(parts, 1):
-        tell(f"judge and proof of part {i} of {len(parts)}")
-        on_box = DesignOnBox(part.problem, tuple(theta), part.design)
-        worst = on_box.worst(workers=workers)[0]
-        wide, checked, proof = on_box.judged(worst, workers)
-        judgement = judgement_of(wide, checked)
-        found.append(Segment(**vars(part), judgement=judgement, proof=proof))
+    """Judge and prove every part; the proofs are spread over the workers."""
+    tell(f"judge and proof of {counted(len(parts), 'part')}")
+    on_boxes = [DesignOnBox(part.problem, tuple(theta), part.design) for part in parts]
+    tasks = {i: (one, None, boxes) for i, one in enumerate(on_boxes)}
+    proofs, found = dict(results(workers, DesignOnBox.proof, tasks)), []
+    for i, (part, on_box) in enumerate(zip(parts, on_boxes, strict=True)):
+        judgement = judgement_of(*on_box.on_lattice(on_box.worst(workers=workers)[0], workers))
+        found.append(Segment(**vars(part), judgement=judgement, proof=proofs[i]))
     return found

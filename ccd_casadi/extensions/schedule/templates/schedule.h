@@ -3,7 +3,8 @@
  * Call schedule_step once every {{ period }} s ({{ rate }} Hz) with the measured {{ name }}; {{ delay }} s from
  * reading y to the new u at the actuator, and a zero-order hold.
  *   e: r - y in m; u: forces in N
- * {{ name }} may change by {{ allowed }} {{ unit }}/s: simulated, see schedule.json.
+ * {{ name }} may change by {{ allowed }} {{ unit }}/s, simulated; a Lyapunov function falls up to {{ bound }} {{ unit }}/s, where
+ * {{ name }} turns back {{ wait }} s after a handover or later: see schedule.json.
  * Compile with -ffp-contract=off where results have to be the same on every machine.
  */
 #ifndef SCHEDULE_H
