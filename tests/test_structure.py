@@ -161,3 +161,12 @@ def test_parsed_sentences_are_seen(line: str) -> None:
 )
 def test_what_is_no_parsed_sentence(line: str) -> None:
     assert not parsed_sentences(ast.parse(line))
+
+
+def test_no_two_classes_have_one_name() -> None:
+    """A reader who finds `Figure` has found the one."""
+    names = [
+        node.name for tree in modules().values() for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    ]  # fmt: skip
+    assert sorted({name for name in names if names.count(name) > 1}) == []

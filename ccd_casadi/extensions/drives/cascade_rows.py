@@ -106,7 +106,7 @@ class SearchOptions:
     edge: float = 1e-9
 
 
-class Responses(NamedTuple):
+class SensorResponses(NamedTuple):
     """A plant on a grid: G (p, k) of the sensors as they are sampled; where z/d is bounded G_zd
     (k,), G_zu G_jd (p, k) and the bound (k,)."""
 
@@ -114,7 +114,7 @@ class Responses(NamedTuple):
     forces: tuple[np.ndarray, np.ndarray, Array] | None = None
 
 
-class Figure(NamedTuple):
+class BoundedFigure(NamedTuple):
     """A figure |N/D| at a place, its bound, and the slopes (k, n) of its ln."""
 
     place: int | str | None
@@ -185,21 +185,21 @@ class CascadeRows:
         self.omega, self.z = omega, np.exp(1j * omega * self.period)
         self.seen = self._responses(omega)
 
-    def _responses(self, omega: Array) -> list[Responses]:
+    def _responses(self, omega: Array) -> list[SensorResponses]:
         """Every plant at these frequencies."""
         found = []
         for system, (plant, drive, counted) in zip(self.systems, self.plants, strict=True):
             G = system.swept(omega)[:, :, 0].T
             most = self.bounds.compliance_max
             if most is None:
-                found.append(Responses(G))
+                found.append(SensorResponses(G))
                 continue
             C = np.vstack([plant.C, counted])
             d = strictly_proper(plant.A, drive, C).swept(omega)[:, :, 0].T
             late = strictly_proper(plant.A, plant.B, counted)
             u = sampled(late, self.period, self.sampling.delay).swept(omega)[:, 0, 0]
             limit = np.where(omega <= self.cascade.stiff_below, most, np.inf)
-            found.append(Responses(G, (d[-1], u * d[:-1], limit)))
+            found.append(SensorResponses(G, (d[-1], u * d[:-1], limit)))
         return found
 
     def _mass(self, plant: StateSpace) -> float:
@@ -351,7 +351,9 @@ class CascadeRows:
         over = np.flatnonzero(2.0 * S**2 > 1.0)
         return float(self.omega[over[0]]) if len(over) else float(self.omega[-1])
 
-    def _figures(self, one: Responses, K: np.ndarray, dK: np.ndarray | None = None) -> list[Figure]:
+    def _figures(
+        self, one: SensorResponses, K: np.ndarray, dK: np.ndarray | None = None
+    ) -> list[BoundedFigure]:
         """|S| at every place, and |z/d|; with slopes where those of K are given."""
         dK = np.zeros((0, *K.shape)) if dK is None else dK
         L, dL, b = one.G * K, one.G * dK, self.bounds
@@ -368,5 +370,5 @@ class CascadeRows:
             N = free * D - (K * through).sum(axis=0)
             dN = free * dD - (dK * through).sum(axis=1)
             found.append((FORCE, N, dN, limit))
-        return [Figure(place, np.abs(N / D), limit, (dN / N - dD / D).real.T)
+        return [BoundedFigure(place, np.abs(N / D), limit, (dN / N - dD / D).real.T)
                 for place, N, dN, limit in found]  # fmt: skip

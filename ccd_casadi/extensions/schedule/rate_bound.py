@@ -66,7 +66,7 @@ class RateBoundOptions:
 
 
 @dataclass(frozen=True)
-class Modes:
+class PartModes:
     """Of a part: A and Y at its positions (N, n, n), and how many modes are slow."""
 
     loops: Array
@@ -93,7 +93,7 @@ class Modes:
         return np.maximum(least, self.norms(rest + share * moved, self.slow))
 
 
-def modes_of(loops: Array, options: RateBoundOptions = RateBoundOptions()) -> Modes:
+def modes_of(loops: Array, options: RateBoundOptions = RateBoundOptions()) -> PartModes:
     """Y of a part: its groups are apart where neighbouring decays are, in the mean of p."""
     values, X = np.linalg.eig(loops)
     order = np.argsort(-np.abs(values), axis=1)
@@ -114,7 +114,7 @@ def modes_of(loops: Array, options: RateBoundOptions = RateBoundOptions()) -> Mo
             P = solve_discrete_lyapunov(part.conj().T / sigma, Q)
             rows.append(np.linalg.cholesky(P).conj().T @ onto)
         found.append(np.vstack(rows))
-    return Modes(loops, np.array(found), slow)
+    return PartModes(loops, np.array(found), slow)
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def rate_bound(
     return RateBound(low, len(loops[0]), *sets, tuple(waits))
 
 
-def _jump(parts: Sequence[Modes], one: Border, E: Array, segments: Sequence[Segment]) -> Array:
+def _jump(parts: Sequence[PartModes], one: Border, E: Array, segments: Sequence[Segment]) -> Array:
     """B of a handover."""
     before, after, own = parts[one.first], parts[one.then], segments[one.then]
     k = int((one.at - own.low) / (own.high - own.low) * (len(after.Y) - 1))
