@@ -28,8 +28,6 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     require_as_returned,
 )
-from ccd_casadi.inner_problem.searched_problem import state_of
-from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
@@ -48,6 +46,7 @@ from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 
 if TYPE_CHECKING:
     from ccd_casadi.fixed_structure.design import SectionsDesign
+    from ccd_casadi.lti.between_samples import BetweenSamples
 
 
 def written_plants(
@@ -112,6 +111,7 @@ def second_on_weighted(
 
 def plants_of_set(problem: CoDesignProblem, theta: Sequence[float]) -> list[StateSpace]:
     """The plants at θ that the certificate of sections is of, as they were written, SI."""
+    from ccd_casadi.inner_problem.searched_problem import state_of
     from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 
     uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
@@ -139,7 +139,7 @@ def second_on_set(
 
 def between_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign"
-) -> BetweenSamples | None:
+) -> "BetweenSamples | None":
     """S between the samples of a design's loops, on the plants of its certificate; None of a
     continuous loop, and where a plant is known at the instants alone."""
     judged, K, sampling = design.certificate, design.controller, problem.sampling
@@ -147,6 +147,8 @@ def between_on_set(
         return None
     if not all(figures.stable for figures in judged.plants):
         return None
+    from ccd_casadi.lti.between_samples import worst_between
+
     peaks = [figures.S_peak for figures in judged.plants]
     places = kind_of(problem).bounds().places
     return worst_between(plants_of_set(problem, theta), peaks, K, sampling, places)

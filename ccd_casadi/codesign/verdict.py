@@ -14,17 +14,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
-from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.optim.kkt import KktCertificate, KktOptions
 from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
+
+if TYPE_CHECKING:
+    from ccd_casadi.lti.between_samples import BetweenSamples
 
 
 @dataclass(frozen=True)
@@ -415,7 +417,7 @@ def survives(
     return line(state, tuple(found))
 
 
-def between_finding(found: BetweenSamples, S_max: float, excess: float) -> tuple[bool, Finding]:
+def between_finding(found: "BetweenSamples", S_max: float, excess: float) -> tuple[bool, Finding]:
     """Say what S is between the samples.
 
     Parameters
@@ -438,7 +440,7 @@ def between_finding(found: BetweenSamples, S_max: float, excess: float) -> tuple
 
 def deployable(
     survival: Survival | None, sampling: Sampling | None = None,
-    between: BetweenSamples | None = None, S_max: float = math.inf,
+    between: "BetweenSamples | None" = None, S_max: float = math.inf,
     options: VerdictOptions = VerdictOptions(),
 ) -> Check:  # fmt: skip
     """Write the line `deployable` before `deploy`.

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
@@ -32,6 +31,9 @@ from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.second_engine import NOT_COMPARED, EngineComparison
 from surrogates import GaussianProcess, Quality
+
+if TYPE_CHECKING:
+    from ccd_casadi.lti.between_samples import BetweenSamples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +78,7 @@ class Verified(ABC):
     survival: Survival | None
     damping: OtherDamping | None
     second: EngineComparison = NOT_COMPARED
-    between: BetweenSamples | None = None
+    between: "BetweenSamples | None" = None
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
     saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards
