@@ -1,14 +1,16 @@
 """A controller of fixed structure as a motion engineer reads it: sections in Hz and damping."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, spoken
+
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def gain_of(kappa: Array) -> float:
     return float(np.exp(kappa[0]))
 
 
-def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict[str, Any]:
+def sections_dict(structure: "Structure | ChannelStructure", kappa: Array) -> dict[str, Any]:
     """Make the entry `controller` of result.json and `sections` of controller.json.
 
     Parameters
@@ -112,7 +114,7 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
         Of several channels each is under `channels` with its directions, and all sections are in
         one list.
     """
-    if isinstance(structure, ChannelStructure):
+    if not isinstance(structure, Structure):
         return _channels_dict(structure, kappa)
     units = dict(zip(ParameterKind, (spoken("N/m"), "Hz", "1"), strict=True))
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
@@ -129,7 +131,7 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
     }  # fmt: skip
 
 
-def _channels_dict(structure: ChannelStructure, kappa: Array) -> dict[str, Any]:
+def _channels_dict(structure: "ChannelStructure", kappa: Array) -> dict[str, Any]:
     own = structure.decoupling
     channels = [
         {"name": name, "outputs": own.outputs[:, i].tolist(), "inputs": own.inputs[:, i].tolist()}
