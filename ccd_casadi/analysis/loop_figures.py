@@ -49,6 +49,8 @@ class LoopFigureOptions:
         Points of a continuous loop's step in a period of ω_b.
     band : float
         About its end, in which a step has settled.
+    decayed : float
+        Of its largest displacement, what is left where a step of force has decayed.
     warnings : LoopWarningOptions
         Of what is warned of.
     """
@@ -59,6 +61,7 @@ class LoopFigureOptions:
     at_rest: float = 1e-3
     per_period: int = 100
     band: float = 0.02
+    decayed: float = 0.1
     warnings: LoopWarningOptions = field(default_factory=LoopWarningOptions)
 
     @property
@@ -71,8 +74,10 @@ class LoopFigureOptions:
 class ForceStep:
     """The largest displacement by a step of 1 N: `size` in m after `seconds`, of output `output` by
     actuator `actuator` on plant `plant`, all from 0 on; `names` of what moves and by what, with
-    their numbers where there are several."""
+    their numbers where there are several. `decay`: the latest time of all pairs in s at which more
+    than `decayed` of the pair's largest displacement is left; inf where a force leaves more."""
 
+    decay: float
     size: float
     seconds: float
     output: int
@@ -88,7 +93,8 @@ class ForceStep:
     def entry(self, scalar: bool) -> dict[str, Any]:
         """Of result.json; of several channels with the pair in words."""
         pair = {} if scalar else {"pair": self.pair}
-        return {"seconds": self.seconds, "plant": self.plant + 1, **pair}
+        decay = {"decay_seconds": self.decay} if np.isfinite(self.decay) else {}
+        return {"seconds": self.seconds, "plant": self.plant + 1, **decay, **pair}
 
 
 def until_rest(
@@ -198,17 +204,20 @@ def largest_force_step(
     ForceStep
         Until the loop is at rest.
     """
-    found = []
+    found, decay = [], 0.0
     for plant, loop in enumerate(loops):
         times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
+        left = np.abs(y) > options.decayed * np.abs(y).max(axis=2, keepdims=True)
+        last = int(np.flatnonzero(left.any(axis=(0, 1)))[-1])
+        decay = max(decay, float(times[last]) if last + 1 < len(times) else np.inf)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
         moved = f"{'output' if loop.counted is None else 'performance'} {output + 1}"
         if loop.at and loop.counted is None:
             moved = f"channel {loop.at[0].name}"  # whose error counts
         names = moved, f"{'actuator' if loop.drive is None else 'disturbance'} {actuator + 1}"
-        found.append(ForceStep(size, float(times[k]), output, actuator, plant, names))
-    return max(found, key=lambda step: step.size)
+        found.append(ForceStep(0.0, size, float(times[k]), output, actuator, plant, names))
+    return replace(max(found, key=lambda step: step.size), decay=decay)
 
 
 def compliance_of(loops: Sequence[Loop], omega_low: float) -> tuple[float, float, float, float]:

@@ -171,6 +171,9 @@ class ChannelTable:
     biquads: int | None = key("instead of [controller]'s", None)
     roll_off: int | None = key("instead of [controller]'s", None)
     least_damping: float | None = key("instead of [controller]'s", None, check=checks.DAMPING)
+    slowest_zero_hz: float | None = key(
+        "instead of [controller]'s", None, check=checks.NOT_NEGATIVE
+    )
     S_max: float | None = key(
         "bound of this channel's S, tighter than [inner]'s",
         None,
@@ -209,6 +212,7 @@ class ControllerTable:
     least_damping: float = key(
         "sections: least damping ratio of zeros and poles", 0.0, check=checks.DAMPING
     )
+    slowest_zero_hz: float = key("sections: slowest zero of K", 0.0, check=checks.NOT_NEGATIVE)
     bandwidth_of: str | None = key(
         "sections: of several sensors on one actuator, the channel whose error counts for ω_b", None
     )

@@ -418,9 +418,13 @@ class ChannelStructure:
         for own, place in zip(self.structures, self.slices, strict=True):
             yield own, kappa[..., place]
 
-    def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
-        """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""
-        return np.hstack([self.structures[i].bounds(frequencies, gains) for i in self.free])
+    def bounds(
+        self, frequencies: tuple[float, float], gains: tuple[float, float], omega_0: float
+    ) -> Array:
+        """Lower and upper bounds (2, n) of κ for frequencies and gains within these; frequencies
+        in units of `omega_0` (rad/s)."""
+        own = (self.structures[i] for i in self.free)
+        return np.hstack([one.bounds(frequencies, gains, omega_0) for one in own])
 
     def in_units(self, kappa: Array, frequency: float, gain: float) -> Array:
         """κ with frequencies times `frequency` and gains times `gain`."""

@@ -241,7 +241,7 @@ def box_of(
     span = (min(1e-3, 0.01 * fastest), fastest)
     if frequencies is not None:
         span = (frequencies[0] / omega_0, frequencies[1] / omega_0)
-    return structure.bounds(span, (1e-6, 1e6))
+    return structure.bounds(span, (1e-6, 1e6), omega_0)
 
 
 def _by_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:

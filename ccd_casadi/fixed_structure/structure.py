@@ -18,6 +18,8 @@ import numpy as np
 from ccd_casadi.kernels.sections import GAIN, INTEGRATOR, PAIR, REAL
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.text import HZ
 
 
 class ParameterKind(StrEnum):
@@ -46,6 +48,9 @@ class Structure:
         First-order leads, pairs of zeros and poles, order of the roll-off.
     least_damping : float
         Of the biquads' zeros and poles.
+    slowest_zero_hz : float
+        Least |zero| of K; above 0 no biquad's zeros are two real ones. The loop has poles beside
+        slow zeros of K, and what a constant force moved decays with them; 0 for any.
     """
 
     integrator: bool = True
@@ -53,6 +58,7 @@ class Structure:
     biquads: int = 2
     roll_off: int = 2
     least_damping: float = 0.0
+    slowest_zero_hz: float = 0.0
     # Ratios: below the first a notch is a needle; at the second two real roots are 34 times apart.
     dampings: ClassVar[tuple[float, float]] = (1e-3, 3.0)
     least_roll_off_damping: ClassVar[float] = 0.3  # below it a roll-off is a resonance
@@ -63,6 +69,13 @@ class Structure:
                 raise ValueError(f"{name} is {getattr(self, name)}; give 0 or more sections")
         if not 0.0 <= self.least_damping < self.dampings[1]:
             raise ValueError(f"least_damping is {self.least_damping}; give a ratio from 0 to 1")
+        if not 0.0 <= self.slowest_zero_hz < np.inf:
+            raise ValueError(f"slowest_zero_hz is {self.slowest_zero_hz}; give Hz, or 0 for none")
+
+    def identity(self) -> dict[str, object]:
+        """Its values; of what came later only what is not the default."""
+        later = {"slowest_zero_hz": 0.0}
+        return {key: value for key, value in vars(self).items() if value != later.get(key)}
 
     @property
     def order(self) -> int:
@@ -109,15 +122,26 @@ class Structure:
             at += 2 if kind == PAIR else 1
         return np.array(found, np.int64)
 
-    def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
-        """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""
+    def bounds(
+        self, frequencies: tuple[float, float], gains: tuple[float, float], omega_0: float
+    ) -> Array:
+        """Lower and upper bounds (2, n) of κ for frequencies and gains within these; frequencies
+        in units of `omega_0` (rad/s)."""
         least, most = max(self.least_damping, self.dampings[0]), self.dampings[1]
+        slowest = max(frequencies[0], HZ * self.slowest_zero_hz / omega_0)
+        if slowest >= frequencies[1]:
+            fastest = f"{frequencies[1] * omega_0 / HZ:.4g} Hz"
+            words = f"slowest_zero_hz is {self.slowest_zero_hz:g}; K has no root above {fastest}"
+            raise PlantError(f"{words}: give less")
         found = []
         for name, kind in zip(self.names, self.kinds, strict=True):
+            of_zeros = name == "integrator" or "zero" in name
             if kind is ParameterKind.GAIN:
                 found.append(gains)
             elif kind is ParameterKind.FREQUENCY:
-                found.append(frequencies)
+                found.append((slowest, frequencies[1]) if of_zeros else frequencies)
+            elif of_zeros and self.slowest_zero_hz:
+                found.append((least, max(least, 1.0)))
             elif name.startswith("roll-off"):
                 found.append((max(least, self.least_roll_off_damping), most))
             else:

@@ -83,7 +83,7 @@ class ChannelProblem:
         """Its values; of what came later only those that are not the default."""
         later = {"like": None, "S_max": None, "M_K": None, "bandwidth_ratio": 1.0}
         found = {key: value for key, value in vars(self).items() if value != later.get(key, ...)}
-        return found | {"structure": vars(self.structure)}
+        return found | {"structure": self.structure.identity()}
 
 
 def of_sensor(structure: Structure, counts: bool) -> Structure:
@@ -214,7 +214,7 @@ class StructuredProblem(ControllerProblem):
         """What determines ω_b*(θ), as plain values; of no search state (`SearchedProblem`)."""
         structure, sampling = self.structure, self.sampling
         found: dict[str, Any] = {
-            "structure": vars(structure),
+            "structure": structure.identity(),
             "shape": self.shape,
             "weighted_level": self.weighted_level,
             "compliance_max": self.compliance_max,

@@ -52,7 +52,7 @@ def with_own(whole: ChannelStructure, bounds: Bounds = BOUNDS) -> Bounds:
 def as_one(whole: ChannelStructure, sampling: Sampling | None, off: float, theta=(1.0, 1.0)):
     """The stage with a load off centre beside the empty one, never taken apart."""
     members = plant_set([plant(), plant(theta, off)], sampling, whole.decoupling)
-    box = whole.bounds((1e-3, 1e4), (1e-6, 1e6))
+    box = whole.bounds((1e-3, 1e4), (1e-6, 1e6), 1.0)
     return LoopProblem(members, whole, with_own(whole), box)
 
 

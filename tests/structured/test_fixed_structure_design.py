@@ -36,6 +36,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
+from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis.closed_loop import measure
 
@@ -83,7 +84,26 @@ def test_no_small_change_of_the_parameters_is_better(design) -> None:
             assert assess(problem, moved, tau + 1e-2 * size).violation > 0.0
 
 
+def test_no_zero_of_K_is_slower_than_required(design) -> None:
+    least = 3.0
+    assert np.abs(SMALL.roots(design.kappa)[0]).min() < 0.5 * least * HZ
+    structure = replace(SMALL, slowest_zero_hz=least)
+    found = synthesise_sections([plant()], structure, EASY, starts=2, seed=1)
+    zeros = structure.roots(found.kappa)[0]
+    assert found.certified
+    assert np.abs(zeros).min() == pytest.approx(least * HZ, rel=1e-9)
+    assert found.bandwidth < design.bandwidth
+    gradient_is_of_optima(structure, found)
+    with pytest.raises(PlantError, match="K has no root above"):
+        problem_for([plant()], replace(SMALL, slowest_zero_hz=1e9), EASY)
+
+
 def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
+    gradient_is_of_optima(SMALL, design)
+
+
+def gradient_is_of_optima(structure: Structure, design) -> None:
+    """The gradient over θ against differences of optima."""
     envelope = bandwidth_envelope([plant()], EASY, design)
     assert envelope is not None
     h = 0.02
@@ -93,7 +113,7 @@ def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
             theta = np.array([55.0, 55.0])
             theta[i] += sign * h
             made = synthesise_sections(
-                [plant(theta=theta)], SMALL, EASY, initial=[design.kappa], only_initial=True,
+                [plant(theta=theta)], structure, EASY, initial=[design.kappa], only_initial=True,
                 frequencies=design.frequencies,
             )  # fmt: skip
             assert made.certified

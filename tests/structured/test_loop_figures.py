@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.fixed_structure_loops import FAST, LATE, loop, plant
+from scipy.optimize import brentq
 
 from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import (
@@ -124,6 +125,22 @@ def test_a_force_step_is_followed_to_its_largest(soft_hz: float, sampling: Sampl
     assert found.pair == "output 1 by actuator 2"
     both = [Loop(stiff, one, sampling), Loop(turned(stiff, 3.0), one, sampling)]
     assert largest_force_step(both, w).plant == 1
+
+
+@pytest.mark.parametrize("slow", [0.3, 3.0])
+def test_what_a_force_moved_decays_with_the_slow_pole(slow: float) -> None:
+    """ẏ = u + d under a PI controller: y = (exp(-at) - exp(-bt))/(b - a) after a unit step of d."""
+    a, b = slow, 100.0
+    G = StateSpace(*(np.array([[x]]) for x in (0.0, 1.0, 1.0, 0.0)))
+    K = StateSpace(*(np.array([[x]]) for x in (0.0, 1.0, a * b, a + b)))
+    largest = np.log(b / a) / (b - a)
+    moved = lambda t: (np.exp(-a * t) - np.exp(-b * t)) / (b - a)  # noqa: E731
+    decay = brentq(lambda t: moved(t) - 0.1 * moved(largest), largest, 100.0 / a)
+    found = largest_force_step([Loop(G, K)], b)
+    assert found.decay == pytest.approx(decay, abs=0.02 / a + HZ / b)
+    held = largest_force_step([Loop(G, replace(K, C=0.0 * K.C))], b)
+    assert held.decay == np.inf
+    assert "decay_seconds" not in held.entry(scalar=True)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])

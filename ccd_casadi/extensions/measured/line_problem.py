@@ -231,7 +231,7 @@ def line_problem(
         fastest = min(fastest, 2.0 / plants.period)
     slowest = 0.1 * HZ * min(one[0] for one in hz) / omega_0
     gains = (1e-3 / (force * float(size.max())), 1e3 / (force * float(size.min())))
-    box = structure.bounds((slowest, fastest), gains)
+    box = structure.bounds((slowest, fastest), gains, omega_0)
     v = plants.variable(omega)
     starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
     unsure = force * np.concatenate([one.unsure for one in responses])
