@@ -132,7 +132,7 @@ def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> So
     """From θ to the least J near by; by steps along the truth where the joint search breaks λ.
 
     `settled`: of the terms of J, as in `ListedOptions`; None: as near as any joint search."""
-    best = first = sampler.values(theta, "near by")[0]
+    best = first = sampler.values(theta, "nearby designs")[0]
     required, options = sampler, JointSearchOptions()
     J = objective_of(sampler.problem, first)
     if settled is not None and J:
@@ -140,7 +140,7 @@ def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> So
         share = settled * (abs(hardware) + abs(J - hardware)) / abs(J)
         options = replace(options, model=replace(options.model, settled=share))
     if sampler.problem.figure is BANDWIDTH:
-        tell = printer("near by", sampler.quiet)
+        tell = printer("nearby designs", sampler.quiet)
         required, best, _ = joint_search(sampler, theta, tell, ends=(), options=options)
     if best.theta == first.theta or violated(required.problem, best.theta):  # it lost λ
         descent = ThetaDescentOptions()

@@ -21,6 +21,7 @@ from ccd_casadi.reporting.concerns import (
     resonance_condition,
     unproven,
 )
+from ccd_casadi.support.time_budget import StageOptions
 
 NEXT = {  # what to do about a line that failed, or about what the decision names
     "certified": "make the run again",
@@ -176,7 +177,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
     concerns = [*missed, *weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
-        words = f"the search was ended by its budget of {budget['minutes']:g} min"
+        share, minutes = 100.0 * StageOptions.ending, budget["minutes"]
+        words = f"the search was ended by its {share:g} % of the budget of {minutes:g} min"
         concerns.append(Concern(ConcernKind.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"

@@ -316,7 +316,7 @@ class Sampler:
             bandwidth = self.trace[best].bandwidth / HZ
             label = "best of this part"
             if self.whole:  # of a design that was found before a plant may exceed a bound
-                label = "best so far" if J[best] < self.spent.reported else "best on more plants"
+                label = "best so far" if J[best] < self.spent.reported else "best on all plants"
                 self.spent.reported = min(self.spent.reported, float(J[best]))
             remark(f"{label}: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
 

@@ -120,7 +120,7 @@ def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended = result_of(optimal="unknown") | {"time_budget": {"minutes": 5.0, "ended": True}}
     words = advice(ended)
     assert words.startswith(
-        "Build this only if you accept: the search was ended by its budget of 5"
+        "Build this only if you accept: the search was ended by its 75 % of the budget of 5"
     )
     assert "a larger --budget" in words
     within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
