@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictOptions
+from ccd_casadi.codesign.reasons import Reason
+from ccd_casadi.codesign.verdict import Check, OwnSet, State, VerdictOptions
 from ccd_casadi.reporting.concerns import (
     Concern,
     ConcernKind,
@@ -68,6 +69,10 @@ BOUNDS_KEPT = {
     "optimal": (("optimality", "inner_optimum"), ConcernKind.NOT_OPTIMAL, "it is not the optimum"),
     "predicted": (("prediction",), ConcernKind.MISPREDICTED, "the surrogate mispredicts it"),
 }
+WARNINGS = (
+    Reason.ON_GRID_ALONE, Reason.NOT_CONFIRMED, Reason.NOT_CHALLENGED, Reason.SADDLE,
+    Reason.MISPREDICTED, Reason.EXTRAPOLATES, Reason.LEFT_OUT_TOO_FAR, Reason.BETWEEN_ABOVE,
+)  # fmt: skip
 SENTENCES = {
     Build.YES: "Build this.",
     Build.AFTER_DEPLOY: "Build this after deploy: hold and delay are not judged yet.",
@@ -167,7 +172,7 @@ def decide(result: Mapping[str, Any]) -> Decision:
     if move:
         return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
     warned = [
-        Concern(ConcernKind.LINE_WARNED, f"{name} warned")
+        _warning(Check.read(name, result["verdict"][name]))
         for name, state in states.items()
         if state == State.WARNED and name != "survives"
     ]
@@ -191,8 +196,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
         return Decision(build, unjudged=unjudged, condition=condition)
     remedies = {
         ConcernKind.NOT_OPTIMAL: "optimal",
-        ConcernKind.MISPREDICTED: "predicted",
         ConcernKind.SET_UNPROVEN: "unproven",
+        ConcernKind.MISPREDICTED: "predicted",
         ConcernKind.CURRENT: "current",
         ConcernKind.LOOP: "loop",
         ConcernKind.BETWEEN_LINES: "loop",
@@ -232,6 +237,13 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
     if all(one.reason is ConcernKind.CURRENT for one in concerns):
         step = NEXT["current"]
     return Decision(Build.EXAMINE, tuple(concerns), (step,))
+
+
+def _warning(line: Check) -> Concern:
+    """What a line that warned warns of: among its findings there are good ones too."""
+    of = ConcernKind.MISPREDICTED if line.name == "predicted" else ConcernKind.LINE_WARNED
+    words = [one.words(line.figures) for one in line.findings if one.reason in WARNINGS]
+    return Concern(of, "; ".join(words) or f"{line.name} warned")
 
 
 def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Concern]:

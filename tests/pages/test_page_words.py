@@ -221,6 +221,20 @@ def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
     assert run_head("", result | poor, "", "").decision == said
 
 
+def test_a_decision_says_what_a_line_warns_of() -> None:
+    """Not what else is good of it."""
+    result = result_of(certified="warned", predicted="warned")
+    grid = [{"reason": "judged_on_plants", "plants": 5}, {"reason": "on_grid_alone"}]
+    result["verdict"]["certified"] |= {"findings": grid, "on_grid_alone": ["compliance_max"]}
+    missed = {"findings": [{"reason": "mispredicted"}], "error": 0.02, "tolerance": 0.001}
+    result["verdict"]["predicted"] |= missed
+    assert advice(result) == (
+        "Build this only if you accept: compliance_max: judged on a grid of frequencies alone; "
+        "prediction and truth differ by 2 %, more than 0.1 %. "
+        "Next: retrain, or more points in [sampling]."
+    )
+
+
 def test_what_s_may_reach_between_two_lines_is_said_first() -> None:
     tuned = {"sensitivity_peak": 1.8, "sensitivity_peak_between_lines": 4.78}
     assert "4.78 between two lines" in advice(tuned)
