@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
-from ccd_casadi.plants.plant import ModelFunction, Plant, widened
+from ccd_casadi.plants.model_function import ModelFunction, widened
+from ccd_casadi.plants.plant import Plant
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import (

@@ -10,17 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.plant import (
-    MATRICES,
-    PORTS,
-    Evaluate,
-    Mechanics,
-    ModelFunction,
-    Plant,
-    build_plant,
-    model_parts,
-    named_values,
-)
+from ccd_casadi.plants.model_function import MATRICES, PORTS, ModelFunction, model_parts
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, build_plant, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import PlantError, UserError

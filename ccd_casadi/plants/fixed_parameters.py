@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.lti.wiring import Wiring
-from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
+from ccd_casadi.plants.model_function import ModelFunction
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:

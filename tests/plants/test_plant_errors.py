@@ -9,7 +9,8 @@ import pytest
 
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.plants.plant import PlantError, model_parts
+from ccd_casadi.plants.model_function import model_parts
+from ccd_casadi.support.errors import PlantError
 
 ROOT = Path(__file__).parents[2]
 PLANT = """
