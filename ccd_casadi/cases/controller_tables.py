@@ -247,6 +247,12 @@ class DriveTable:
         "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file like theirs (.toml)", None
     )
     velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
+    lead_mm: float | str | None = key(
+        "of a screw that a rotary motor turns: a number, or a [theta] in mm",
+        None,
+        unit="mm",
+        check=checks.coordinate,
+    )
     position_rate_hz: float | None = key(
         "rate of a slower position loop",
         None,

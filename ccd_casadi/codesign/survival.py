@@ -417,7 +417,7 @@ def survival(
         loops, partial(shift_range, loops, marks=marks), S_max, slack, held
     )
     margins = least_of([least_margins(one.responses, one.grid()) for one in nominal.places])
-    poles = np.linalg.eigvals(loops.controller.A)
+    poles = loops.controller.rates
     sizes = np.abs(poles)  # of an integrator rounding alone
     size = np.maximum(1e-9 * sizes, StaticsOptions().integrator * bandwidth)
     unstable = poles[(poles.real > size) & (poles.imag >= 0.0)]

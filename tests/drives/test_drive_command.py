@@ -36,8 +36,10 @@ def changed(**tables: dict[str, Any]) -> dict[str, Any]:
         ({"drive": {"velocity": "spindle"}}, "one of motor, load"),
         ({"drive": {"position_rate_hz": 3000.0}}, "no whole part of loop.rate_hz"),
         ({"drive": {"position_rate_hz": 2.0}}, "at most twice inner.omega_low_hz"),
-        ({"inner": {"compliance_max": 1e-5}, "drive": {"position_rate_hz": 2000.0}},
-         "compliance_max does not go with a slower position loop"),
+        (
+            {"inner": {"compliance_max": 1e-5}, "drive": {"position_rate_hz": 2000.0}},
+            "compliance_max does not go with a slower position loop",
+        ),
         ({"controller": {"weighted_level": 2.0}}, "weighted_level"),
     ],
 )

@@ -71,6 +71,9 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         if most is None:
             refuse_ports(problem, "[drive] without inner.compliance_max")
         bounds = replace(bounds_of(problem), compliance_max=most)
+        at = problem.start if theta is None else tuple(theta)
+        if (travel := _travel(table.lead_mm, problem, at)) is not None:
+            drive = drive.behind_screw(travel)
         filters: list[Slot] = []
         for place, count in (("current", table.filters), ("setpoint", table.setpoint_filters)):
             there = drive.places(place)
@@ -84,7 +87,6 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
                           _slower(table, problem.sampling, bounds.omega_low),
                           HZ * (table.compliance_hz or np.inf))  # fmt: skip
         require_known(cascade, bounds)
-        at = problem.start if theta is None else tuple(theta)
         uncertain, ported = uncertain_plant(problem, at), None
         if most is not None:
             ported = uncertain_plant(with_ports(problem), at)
@@ -97,6 +99,21 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
     return DriveProblem(problem, at, cascade, uncertain, bounds, problem.sampling, ported)
+
+
+def _travel(
+    lead: float | str | None, problem: CoDesignProblem, theta: Sequence[float]
+) -> float | None:
+    """m of travel per rad of a rotary motor; None of a linear one."""
+    if lead is None:
+        return 1.0 if problem.spoken[0] == "rad" else None
+    if isinstance(lead, str):
+        if dict(zip(problem.names, problem.units, strict=True)).get(lead) != "mm":
+            raise UserError(f"lead_mm is {lead!r}; give a number, or the name of a [theta] in mm")
+        lead = dict(zip(problem.names, theta, strict=True))[lead]
+    if not lead > 0.0 or problem.spoken[0] == "rad":
+        raise UserError(f"lead_mm is {lead:g}; give mm above 0 per turn, of a plant in m")
+    return 1e-3 * lead / HZ
 
 
 def _slower(table: DriveTable, sampling: Sampling, omega_low: float) -> int:

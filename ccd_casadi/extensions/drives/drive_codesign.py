@@ -119,7 +119,7 @@ def codesign_drive(
     free = [i for i, name in enumerate(problem.names)
             if name not in listed and problem.upper[i] > problem.lower[i]]  # fmt: skip
     lower, upper = np.array(problem.lower)[free], np.array(problem.upper)[free]
-    tried, allowed = 0, _met(problem, problem.start, options)
+    tried, allowed = 0, meets_constraints(problem, problem.start, options)
     for chosen in itertools.product(*lists):
 
         def theta_of(share: Array, chosen: Sequence[float] = chosen) -> tuple[float, ...]:
@@ -136,7 +136,7 @@ def codesign_drive(
             if (
                 found is not None
                 and (found.objective < best.objective or not allowed)
-                and _met(problem, theta, options)
+                and meets_constraints(problem, theta, options)
             ):
                 allowed = True
                 best = found
@@ -146,7 +146,7 @@ def codesign_drive(
 
         begin = (np.array(best.theta)[free] - lower) / (upper - lower)
         if not free:
-            if _met(problem, theta_of(begin), options):
+            if meets_constraints(problem, theta_of(begin), options):
                 objective(begin)
             continue
         limits = NonlinearConstraint(
@@ -162,7 +162,11 @@ def codesign_drive(
     return first, best
 
 
-def _met(problem: CoDesignProblem, theta: Sequence[float], options: DriveCodesignOptions) -> bool:
+def meets_constraints(
+    problem: CoDesignProblem, theta: Sequence[float],
+    options: DriveCodesignOptions = DriveCodesignOptions(),
+) -> bool:  # fmt: skip
+    """Whether θ meets the constraints of the plant."""
     values = constraint_values(plant_of(problem), theta)
     return bool((values <= options.met).all())
 

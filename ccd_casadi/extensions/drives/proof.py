@@ -9,7 +9,7 @@ integrator are infinite. Where Δ has no zero on the circle for a connected set 
 one is stable, all are.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -152,5 +152,4 @@ def prove_cascade(
             sensors=(cascade.position, cascade.velocity),
         ))  # fmt: skip
     share = options.most_boxes // len(families)
-    found = divide([*families], uncertain.box, slack, share, None, None, options)
-    return replace(found, channels=False)
+    return divide([*families], uncertain.box, slack, share, None, None, options)

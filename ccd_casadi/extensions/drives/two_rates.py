@@ -89,6 +89,14 @@ class LiftedLoop:
             return found
         return np.asarray(np.fmax(found, np.abs(np.linalg.eigvals(S)).max(axis=1)))
 
+    def grid(self, lowest: float) -> Array:
+        """ω in rad/s from `lowest` to half the velocity loop's rate, fine about its poles."""
+        top, poles, o = 0.999999 * np.pi / self.period, self.poles, TwoRateOptions()
+        near = root_flanks(poles[poles.imag > 0.0])
+        near = near[(near > lowest) & (near < top)]
+        even = np.linspace(lowest, top, o.points)
+        return np.unique([*np.geomspace(lowest, top, o.points), *even, *near])
+
     @property
     def radius(self) -> float:
         """The spectral radius of Φ over one instant, 1 at the limit of stability."""
@@ -217,6 +225,13 @@ def judge_two_rates(
     return SetCertificate(passed, bandwidth, tuple(one for one, _ in found), worst, words)
 
 
+def place_name(bounds: Bounds, place: int | None) -> str:
+    """Name a place where the loop may be broken: its channel, or what there is without channels."""
+    if place is None:
+        return "actuator"
+    return bounds.channels[place].name if bounds.channels else "the sensor"
+
+
 def _figures(
     loop: LiftedLoop, cascade: Cascade, bounds: Bounds, options: TwoRateOptions
 ) -> tuple[PlantFigures, dict[str, float]]:
@@ -225,17 +240,11 @@ def _figures(
     if not radius < 1.0:
         return PlantFigures(stable=False, stability=radius - 1.0), {}
     own = {c.name: c.S_max or bounds.S_max for c in bounds.channels}
-    top = 0.999999 * np.pi / cascade.period
-    omega = np.geomspace(options.lowest * bounds.omega_low, top, options.points)
-    even, poles = np.linspace(0.0, top, options.points)[1:], loop.poles
-    near = root_flanks(poles[poles.imag > 0.0])
-    omega = np.unique([*omega, *even, *near[(near > 0.0) & (near < top)], bounds.omega_low])
+    omega = np.union1d(loop.grid(options.lowest * bounds.omega_low), bounds.omega_low)
     shares, S = {}, omega
     for place in loop.places:
-        found = loop.sensitivity(place, omega)
-        name = "actuator" if place is None else (
-            bounds.channels[place].name if bounds.channels else "")  # fmt: skip
-        key = f"S_MAX of {name}" if name else "S_MAX"
+        found, name = loop.sensitivity(place, omega), place_name(bounds, place)
+        key = f"S_MAX of {name}" if bounds.channels else "S_MAX"
         shares[key] = float(found.max()) / own.get(name, bounds.S_max)
         S = found if place == cascade.position else S
     peak, peak_at = float(S.max()), float(omega[S.argmax()])
@@ -243,7 +252,7 @@ def _figures(
     shares["S_LOW"] = float(S[np.searchsorted(omega, bounds.omega_low)]) / bounds.S_low
     below = omega < np.pi / (cascade.slower * cascade.period)  # above it the position is aliased
     crossed = np.flatnonzero(2.0 * S**2 > 1.0)
-    crossing = float(omega[crossed[0]]) if len(crossed) else top
+    crossing = float(omega[crossed[0]]) if len(crossed) else float(omega[-1])
     bandwidth = crossing if bounds.shape is None else float(
         (omega / bounds.reached(np.sqrt(2.0) * S))[below].min())  # fmt: skip
     figures = PlantFigures(S_peak=peak, S_peak_frequency=peak_at, bandwidth=bandwidth,
