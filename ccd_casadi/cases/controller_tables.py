@@ -253,6 +253,11 @@ class DriveTable:
         unit="mm",
         check=checks.coordinate,
     )
+    coil: tuple[float, ...] = key(
+        "designs the current loop: resistance (ohm), inductance (H), its rate (Hz)",
+        (),
+        check=checks.every(checks.POSITIVE, "give three numbers above 0: ohm, H, Hz", 3, 3),
+    )
     position_rate_hz: float | None = key(
         "rate of a slower position loop",
         None,

@@ -196,11 +196,11 @@ class ProofOutcome(StrEnum):
         "was searched"
     )
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
-    LIFTED = "the loop has two rates, whose plants are not enclosed, so the set was searched"
+    AS_RUN = "two rates, actuators and sensors that lag are not enclosed, so the set was searched"
 
 
 NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.FIRST_ORDER,
-                  ProofOutcome.WIRED, ProofOutcome.VARIES, ProofOutcome.LIFTED)  # fmt: skip
+                  ProofOutcome.WIRED, ProofOutcome.VARIES, ProofOutcome.AS_RUN)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def test_what_is_searched_and_not_proven_is_verified_with_a_line_that_names_it(
 
 def test_two_rates_are_searched_and_what_is_not_judged_warns() -> None:
     drive = bench()
-    design = replace(made(drive, slower=4), proof=Proof(ProofOutcome.LIFTED, 0.0, ()))
+    design = replace(made(drive, slower=4), proof=Proof(ProofOutcome.AS_RUN, 0.0, ()))
     found = verdict_entry(drive, design)
     assert found["status"] == "verified"
     assert found["verdict"]["survives"]["set"] == "searched"
@@ -186,3 +186,43 @@ def test_todays_value_is_beside_the_new_one_in_the_drives_unit() -> None:
     design = replace(design, cascade=drive.cascade, values=values)
     row = sheet_rows(design, {"p1460": 2.5})[1]
     assert (row["number"], row["unit"], row["today"]) == ("p1460", "N m s/rad", 2.5)
+
+
+def test_a_coil_designs_the_current_loop_that_the_plant_has() -> None:
+    """Against the PI of the sheet on R and L, sampled at its rate with one period to compute."""
+    R, L, rate = 0.8, 4e-3, 16e3
+    data = read_toml(BENCH)
+    data["drive"]["coil"] = [R, L, rate]
+    drive = drive_problem(parse_case(data, BENCH))
+    (gain, Kp), (time, Tn) = drive.cascade.current
+    assert (gain.number, gain.unit, time.number, time.unit) == ("p1715", "V/A", "p1717", "ms")
+    assert Tn == pytest.approx(L / R, rel=1e-3)
+    omega = HZ * np.array([50.0, 100.0, 200.0, 400.0])
+    T = 1.0 / rate
+    z, s = np.exp(1j * omega * T), 1j * omega
+    a = np.exp(-R / L * T)
+    held = (1.0 - a) / R / (z - a) / z * Kp * (1.0 + T / Tn / (1.0 - 1.0 / z))
+    closed = held / (1.0 + held)
+    plain = drive_problem(parse_case(read_toml(BENCH), BENCH))
+    both = [own.uncertain.plant(own.uncertain.nominal).plant_si().at(s)[:, 0, 0]
+            for own in (drive, plain)]  # fmt: skip
+    np.testing.assert_allclose(both[0] / both[1], closed, atol=0.02)  # 0.016 at 400 Hz
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"drive": {"coil": [0.8, 4e-3, 16e3]}, "actuator": {"lag_hz": 900.0}}, "one of both"),
+        ({"drive": {"coil": [0.8, 4e-3, 16e3], "name": "synapticon", "filters": 1,
+                    "setpoint_filters": 0}}, "no parameters of a current controller"),
+        ({"drive": {"coil": [0.8, 4e-9, 16e3]}}, "which the drive has not"),
+    ],
+)  # fmt: skip
+def test_a_coil_that_does_not_go_with_the_drive_is_named(
+    tables: dict[str, dict[str, object]], words: str
+) -> None:
+    data = read_toml(BENCH)
+    for name, table in tables.items():
+        data[name] = {**data.get(name, {}), **table}
+    with pytest.raises(UserError, match=words):
+        drive_problem(parse_case(data, BENCH))

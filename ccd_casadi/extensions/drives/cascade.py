@@ -55,6 +55,8 @@ class Cascade:
         N: the position's error is read at every N-th instant, and held between (`two_rates`).
     stiff_below : float
         rad/s up to which compliance_max holds.
+    current : tuple of (Setting, float)
+        Of a designed current loop (`drive_case`), SI.
     """
 
     drive: Drive
@@ -68,6 +70,7 @@ class Cascade:
     decay: float = 4.0
     slower: int = 1
     stiff_below: float = np.inf
+    current: tuple[tuple[Setting, float], ...] = ()
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:

@@ -8,9 +8,9 @@ import numpy as np
 from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.case_problem import plain_case, problem_of
 from ccd_casadi.cases.checks import CaseError
-from ccd_casadi.cases.controller_tables import DriveTable
+from ccd_casadi.cases.controller_tables import DriveTable, FiltersTable
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
+from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot, read_drive
 from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -63,7 +63,12 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             words = f"{drive.title} has no cascade; its PID is not designed yet"
             raise UserError(f"{words}: use `ccd tune`, or another drive")
         most = case.inner.compliance_max
-        problem = problem_of(plain_case(case))
+        plain, current = plain_case(case), ()
+        if table.coil:
+            if case.actuator != FiltersTable():
+                raise UserError("coil designs what [actuator] states; give one of both")
+            plain, current = _with_current_loop(plain, drive, table.coil)
+        problem = problem_of(plain)
         if not isinstance(problem.controller, StructuredProblem):
             raise UserError('controller.structure is not "sections"; a drive needs that')
         if problem.sampling is None:
@@ -85,7 +90,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
                           table.filter_gain, table.filters_above, table.decay,
                           _slower(table, problem.sampling, bounds.omega_low),
-                          HZ * (table.compliance_hz or np.inf))  # fmt: skip
+                          HZ * (table.compliance_hz or np.inf), current)  # fmt: skip
         require_known(cascade, bounds)
         uncertain, ported = uncertain_plant(problem, at), None
         if most is not None:
@@ -99,6 +104,29 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
     return DriveProblem(problem, at, cascade, uncertain, bounds, problem.sampling, ported)
+
+
+def _with_current_loop(
+    case: Case, drive: Drive, coil: Sequence[float]
+) -> tuple[Case, tuple[tuple[Setting, float], ...]]:
+    """The case with the loop of a current controller as its actuator, and the controller.
+
+    By the magnitude optimum Kp = L/(2σ), Tn = L/R, σ = 1.5 of its periods: one to compute, a half
+    of the hold. Tn cancels the coil's pole; with Kp as it is rounded, σ as a lag, and without the
+    motor's EMF, the current follows as 1/(1 + sL/Kp (1 + σs)).
+    """
+    R, L, rate = coil
+    gain, time = drive.current, drive.current_integral
+    if gain is None or time is None:
+        raise UserError(f"{drive.title} has no parameters of a current controller; drop coil")
+    sigma = 1.5 / rate
+    Kp, Tn = gain.rounded(L / (2.0 * sigma)), time.rounded(L / R)
+    if not Kp > 0.0 or abs(Tn * R / L - 1.0) > 0.05:
+        words = f"coil needs Kp {L / (2.0 * sigma):g} V/A and Tn {L / R:g} s"
+        raise UserError(f"{words}, which the drive has not; correct it, or give [actuator] instead")
+    omega = np.sqrt(Kp / (L * sigma))
+    lag = FiltersTable(second_order_hz=float(omega / HZ), damping=float(0.5 / (sigma * omega)))
+    return replace(case, actuator=lag), ((gain, Kp), (time, Tn))
 
 
 def _travel(

@@ -220,6 +220,8 @@ class Drive:
         Filters, in the order in which they are used.
     speed_feedforward, force_feedforward : Setting or None
         Of the setpoint's velocity, 1 for all of it, and of its acceleration, kg.
+    current, current_integral : Setting or None
+        Gain of the current controller in V/A, and its integral time in s.
     sources, chosen, unknown : tuple of str
         What manuals say, what is this file's choice, and what no manual was found for.
     """
@@ -237,6 +239,8 @@ class Drive:
     unknown: tuple[str, ...]
     speed_feedforward: Setting | None = None
     force_feedforward: Setting | None = None
+    current: Setting | None = None
+    current_integral: Setting | None = None
 
     def places(self, place: str) -> tuple[Slot, ...]:
         """Its filters at a place."""
@@ -307,7 +311,7 @@ def _drive(data: dict[str, Any]) -> Drive:
                            for key in ("sources", "chosen", "unknown")}  # fmt: skip
     for key in ("position", "velocity", "integral"):
         own[key] = _setting(key, data.pop(key))
-    for key in ("speed_feedforward", "force_feedforward"):
+    for key in ("speed_feedforward", "force_feedforward", "current", "current_integral"):
         own[key] = _setting(key, data.pop(key)) if key in data else None
     rule, number = Rule(data.pop("rule")), Number(data.pop("number"))
     if data["loop"] not in ("cascade", "pid"):

@@ -255,7 +255,7 @@ def _design_two_rates(
     band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
     worst = Excess(0, uncertain.nominal, float(np.log(max(judged.worst.values(), default=np.inf))))
     return DriveDesign(cascade, rounded.values, band, free, judged,
-                       Proof(ProofOutcome.LIFTED, 0.0, uncertain.names), worst,
+                       Proof(ProofOutcome.AS_RUN, 0.0, uncertain.names), worst,
                        mass=rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 

@@ -45,6 +45,7 @@ def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture
     period, late = 1e6 * own.period, 1e6 * drive.sampling.delay
     often = f"every {number(own.slower * period)} µs"
     ahead, at_speed = rows[len(own.settings) :], own.drive.speed_feedforward is not None
+    ahead, inner = ahead[: len(design.feedforward)], ahead[len(design.feedforward) :]
     blocks = [_block("position", often, [*rows[:1], *ahead[:at_speed]], "", "left")]
     current: list[dict[str, Any]] = []
     at = 3
@@ -55,7 +56,7 @@ def diagram(drive: DriveProblem, design: DriveDesign, today: Today) -> c.Picture
         (current if slot.place == "current" else blocks).append(block)
     blocks.append(_block("velocity", f"every {number(period)} µs", [*rows[1:3], *ahead[at_speed:]],
                          "", "right"))  # fmt: skip
-    blocks += [*current, _block("current loop", f"part of the delay, {number(late)} µs", [], "")]
+    blocks += [*current, _block("current loop", f"delay of {number(late)} µs", inner, "")]
     blocks.append(_block("machine", "", [], ""))
     y = 18
     for block in blocks:

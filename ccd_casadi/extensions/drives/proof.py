@@ -143,7 +143,8 @@ def prove_cascade(
         unit = options.unit_frequency * max(bandwidth, fastest, bounds.omega_low)
         sampled = SampledModel(uncertain, option, sampling, unit)
         if not sampled.faithful:
-            return Proof(ProofOutcome.VARIES, slack, names)
+            outcome = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.AS_RUN
+            return Proof(outcome, slack, names)
         p, none = len(model.C), np.zeros(0)
         families.append(CascadeFamily(
             ModalSum(none, none.astype(bool), none, 0.0, none, none, none.astype(bool)), names, (),

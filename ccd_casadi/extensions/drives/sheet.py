@@ -26,7 +26,7 @@ def sheet_rows(design: DriveDesign, today: Today | None = None) -> list[dict[str
     """One entry for each parameter, in the drive's unit; `today`'s values by number or name."""
     rows, given = [], today or {}
     own = zip(design.cascade.settings, design.values.tolist(), strict=True)
-    for setting, value in [*own, *design.feedforward]:
+    for setting, value in [*own, *design.feedforward, *design.cascade.current]:
         shown = setting.shown(round(value * setting.per_si / setting.step))
         old = given.get(setting.name, given.get(setting.number))
         rows.append({"number": setting.number, "name": setting.name, "value": shown,
