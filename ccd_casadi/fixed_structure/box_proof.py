@@ -196,7 +196,10 @@ class ProofOutcome(StrEnum):
         "was searched"
     )
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
-    AS_RUN = "two rates, actuators and sensors that lag are not enclosed, so the set was searched"
+    AS_RUN = (
+        "two rates, lags of actuators or sensors, or more than three parameters are not enclosed, "
+        "so the set was searched"
+    )
 
 
 NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.FIRST_ORDER,

@@ -37,22 +37,7 @@ class DriveProblem:
 
 
 def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProblem:
-    """The problem of a case at a θ, or at its start.
-
-    Parameters
-    ----------
-    case : Case
-    theta : sequence of float, optional
-
-    Returns
-    -------
-    DriveProblem
-
-    Raises
-    ------
-    UserError
-        What does not go with a drive.
-    """
+    """The problem of a case at a θ, or at its start; UserError: what does not go with a drive."""
     table = case.drive
     if table.name is None:
         words = "drive.name: is missing; add a table [drive] with the drive's name"
@@ -63,7 +48,7 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             words = f"{drive.title} has no cascade; its PID is not designed yet"
             raise UserError(f"{words}: use `ccd tune`, or another drive")
         most = case.inner.compliance_max
-        plain, current = plain_case(case), ()
+        plain, current = plain_case(case), tuple[tuple[Setting, float], ...]()
         if table.coil:
             if case.actuator != FiltersTable():
                 raise UserError("coil designs what [actuator] states; give one of both")

@@ -85,27 +85,10 @@ def codesign_drive(
     drive: DriveProblem, seed: int = 0, progress: Tell = silent,
     options: DriveCodesignOptions = DriveCodesignOptions(),
 ) -> tuple[DriveAt, DriveAt]:  # fmt: skip
-    """Find the best θ for a drive's cascade.
+    """Find the best θ for a drive's cascade, from the case's start, which has to have one.
 
-    Parameters
-    ----------
-    drive : DriveProblem
-        At the case's start, whose values have to be a design.
-    seed : int
-    progress : callable
-        Takes a line at each θ.
-    options : DriveCodesignOptions
-
-    Returns
-    -------
-    DriveAt, DriveAt
-        At the start, and at the best θ.
-
-    Raises
-    ------
-    UserError
-        No cascade meets the bounds at the start, no θ that was tried meets the constraints, or J
-        counts another figure than ω_b.
+    Raises UserError where no θ that was tried has a cascade and meets the constraints, or J counts
+    another figure than ω_b. Returns what is at the start, and at the best θ.
     """
     problem = drive.problem
     require_bandwidth(problem, "ccd drive --codesign")

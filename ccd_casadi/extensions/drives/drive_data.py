@@ -263,23 +263,7 @@ PLACES = ("current", "setpoint")
 
 
 def read_drive(name: str, folder: Path = Path()) -> Drive:
-    """Read a drive's data file.
-
-    Parameters
-    ----------
-    name : str
-        One that ships with the package, or the path of a file, relative to `folder`.
-    folder : Path
-
-    Returns
-    -------
-    Drive
-
-    Raises
-    ------
-    UserError
-        There is none, or what is wrong in it.
-    """
+    """Read a drive that ships with the package, or the path of a file, relative to `folder`."""
     path = folder / name
     try:
         if name.endswith(".toml"):

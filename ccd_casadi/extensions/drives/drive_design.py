@@ -213,9 +213,9 @@ def design_drive(
     if moved is not None:
         most = float(moved.max())
         proof = replace(proof, left="compliance_max is judged, not proven")
+    over = excesses(judged, bounds, 0.0)  # ω_b is by definition the least of these plants
     if draws and (most is not None or not proof.conclusive):
-        good = int(np.sum(over[len(tried) - draws :] <= options.lower))
-        drawn = Yield(good, draws, number)
+        drawn = Yield(int(np.sum(over[-draws:] <= options.lower)), draws, number)
     if all(one.stable for one in judged.plants):
         K, peaks = cascade.state_space(rounded.values), [one.S_peak for one in judged.plants]
         between = worst_between(uncertain.as_written(tried), peaks, K, sampling, bounds.places)
@@ -344,17 +344,7 @@ def rigid_mass(uncertain: UncertainPlant, position: int) -> float:
 
 
 def first_points(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
-    """List the corners, and between the model and each of them half way.
-
-    Parameters
-    ----------
-    uncertain : UncertainPlant
-
-    Returns
-    -------
-    list of (int, array)
-        Options and points of the box.
-    """
+    """List options and points: the corners, and between the model and each of them half way."""
     corners = uncertain.corners()
     middle = uncertain.nominal
     between = [(option, 0.5 * (point + middle)) for option, point in corners

@@ -81,7 +81,7 @@ def lifted(problem: DriveProblem, design: DriveDesign) -> list[LiftedLoop]:
 
 def _margins(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     """The least of these plants at every place, and of all places."""
-    loops, rows = lifted(problem, design), []
+    loops, rows = lifted(problem, design), list[dict[str, Any]]()
     for place in loops[0].places:
         each, peak = [], 0.0
         for loop in loops:

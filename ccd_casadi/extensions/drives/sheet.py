@@ -11,13 +11,14 @@ from ccd_casadi.extensions.drives.drive_case import DriveProblem
 from ccd_casadi.extensions.drives.drive_codesign import DriveAt
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.drive_verdict import verdict_entry
+from ccd_casadi.extensions.drives.two_rates import place_name
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.reporting.concerns import lines_of
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import HZ, number
+from ccd_casadi.support.text import HZ, number, with_unit
 
 Today = Mapping[str, float]  # values by number or name
 
@@ -118,6 +119,12 @@ def sheet_figures(
     found.append(("filters", f"raise their gain to {design.rise:.4g} of rest, limit "
                   f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, at least "
                   f"{own.filters_above:.4g}"))  # fmt: skip
+    step = abs(
+        float(design.controller.D[0, own.velocity])
+    )  # the difference, PI and filters at once
+    motor = place_name(problem.bounds, own.velocity)
+    found.append(("encoder", f"a step of 1 n{of.spoken[0]} at {motor} changes the force by "
+                  f"{with_unit(1e-9 * step, of.spoken[1])}"))  # fmt: skip
     found.append(("decay", f"ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
                   f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}"))  # fmt: skip
     if (moved := answer["following_error"]) is not None:
@@ -163,12 +170,11 @@ def sheet_text(
     table = ["  ".join(part.ljust(width) for part, width in zip(line, widths, strict=True)).rstrip()
              for line in lines]  # fmt: skip
     drive = design.cascade.drive
-    lines = [
+    said = [
         ("decision", advice(answer)),
         *((line.name, f"{line.state:9s}{line.words}") for line in lines_of(answer)),
+        *figures,
+        *(("chosen", words) for words in drive.chosen),
+        *(("not known", words) for words in drive.unknown),
     ]
-    found = [drive.title, *table, "",
-             *(f"{name:20s}{words}" for name, words in (*lines, *figures))]  # fmt: skip
-    found += [f"{'chosen':20s}{words}" for words in drive.chosen]
-    found += [f"{'not known':20s}{words}" for words in drive.unknown]
-    return "\n".join(found)
+    return "\n".join([drive.title, *table, "", *(f"{name:20s}{words}" for name, words in said)])

@@ -112,19 +112,7 @@ class LiftedLoop:
 
 
 def lift(cascade: Cascade, values: Array, system: StateSpace) -> LiftedLoop:
-    """Lift the loop of a sampled plant.
-
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI.
-    system : StateSpace
-        From force to all sensors at the cascade's period (`lti.loop.sampled`).
-
-    Returns
-    -------
-    LiftedLoop
-    """
+    """Lift the loop of a plant from force to all sensors, sampled at the cascade's period."""
     one = cascade.position == cascade.velocity
     # the position's error, which is held, apart from the motor's
     K = replace(cascade, position=0, velocity=1, sensors=2).state_space(values)
@@ -190,20 +178,9 @@ def judge_two_rates(
     cascade: Cascade, values: Array, plants: Sequence[StateSpace], bounds: Bounds,
     sampling: Sampling, options: TwoRateOptions = TwoRateOptions(),
 ) -> SetCertificate:  # fmt: skip
-    """Judge a cascade of two rates on plants: stability, |S| at every place, S_low and ω_b.
+    """Judge a cascade of two rates on continuous plants: stability, |S| at every place, S_low, ω_b.
 
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI, as they are rounded.
-    plants : sequence of StateSpace
-        Continuous, SI.
-    bounds, sampling : Bounds, Sampling
-
-    Returns
-    -------
-    SetCertificate
-        `worst` has figures over their bounds by the names of the bounds.
+    `worst` of the certificate has figures over their bounds by the names of the bounds.
     """
     found = [_figures(lift(cascade, values, sampled(plant, sampling.period, sampling.delay)),
                       cascade, bounds, options) for plant in plants]  # fmt: skip
