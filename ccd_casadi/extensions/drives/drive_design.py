@@ -124,6 +124,11 @@ class DriveDesign:
         return f, m
 
     @property
+    def certified(self) -> bool:
+        """Whether the judge passes it."""
+        return self.certificate.passed
+
+    @property
     def rise(self) -> float:
         """What all filters on a sensor's way raise at most, relative to their gain at rest."""
         turn = np.linspace(0.0, np.pi, DriveOptions().rise_points)[1:]

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import gain_margin, loop_entry
+from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.codesign.final_judgement import survived
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.structured_entries import box_findings
-from ccd_casadi.codesign.survival import Survival, loops_of, survival
+from ccd_casadi.codesign.survival import Survival, loops_of
 from ccd_casadi.codesign.verdict import (
     Check,
     OwnSet,
@@ -51,7 +52,7 @@ def verdict_entry(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     """
     own, stable = design.cascade, all(one.stable for one in design.certificate.plants)
     figures: dict[str, Any] = {}
-    certified, survived = _certified(problem, design), None
+    certified, ranges = _certified(problem, design), None
     if stable:
         figures = _margins(problem, design)
     if stable and own.slower == 1:
@@ -61,8 +62,8 @@ def verdict_entry(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
         peak = max(1.0 / one["modulus_margin"] for one in figures["margins"])
         figures = loop_entry(loops, design.bandwidth, peak) | figures
         if certified.state is State.PASSED:
-            survived = _survival(problem, design)
-    lines = certified, _survives(problem, design, survived), _deployable(problem, design, survived)
+            ranges = _survival(problem, design)
+    lines = certified, _survives(problem, design, ranges), _deployable(problem, design, ranges)
     lost = [f"{line.name}: {line.words}" for line in lines if line.state is State.FAILED]
     return {
         "status": "not_verified" if lost else "verified",
@@ -100,7 +101,7 @@ def _margins(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
             "phase_margin_deg": min(one.phase_deg for one in each),
             "gain_up": min(one.gain_up for one in each),
             "gain_down": max(one.gain_down for one in each),
-            "gain_margin": min(gain_margin(one) for one in each),
+            "gain_margin": min(min(one.gain_up, 1.0 / max(one.gain_down, 1e-300)) for one in each),
             "delay_margin_us": 1e6 * min(one.delay for one in each),
             "modulus_margin": 1.0 / peak,
         })  # fmt: skip
@@ -127,24 +128,19 @@ def _worst_words(judged: SetCertificate) -> str:
     return f"exceeds {name} by {100.0 * (share - 1.0):.2g} %" if share > 1.0 else judged.words
 
 
-def _survival(problem: DriveProblem, design: DriveDesign) -> Survival:
-    """The ranges of a certified loop, as `final_judgement.survived` has them."""
-    kind, bounds = kind_of(problem.problem), problem.bounds
-    loops, held = loops_of(problem.problem, problem.theta, design.controller), kind.common_shifts()
-    peak = max(one.S_peak for one in design.certificate.plants) / bounds.S_max
-    return survival(
-        loops, S_max=bounds.S_max, bandwidth=design.bandwidth, omega_low=bounds.omega_low,
-        slack=float(np.fmax(1.0, peak)) * (1.0 + kind.slack) - 1.0,
-        marks=[abs(end) for end in held], held=held,
-    )  # fmt: skip
+def _survival(problem: DriveProblem, design: DriveDesign) -> Survival | None:
+    """The ranges of a certified loop off its model."""
+    loops = loops_of(problem.problem, problem.theta, design.controller)
+    # a drive's design has what is read of one of sections
+    return survived(problem.problem, loops, design)[0]  # type: ignore[arg-type]
 
 
-def _survives(problem: DriveProblem, design: DriveDesign, survived: Survival | None) -> Check:
+def _survives(problem: DriveProblem, design: DriveDesign, ranges: Survival | None) -> Check:
     held = kind_of(problem.problem).common_shifts()
     judged = replace(design.certificate, words=_worst_words(design.certificate))
     known = box_findings(
         judged, len(judged.plants), design.proof, design.worst, design.drawn,
-        along=survived is None or survived.within(*held),
+        along=ranges is None or ranges.within(*held),
     )  # fmt: skip
     if judged.passed and design.cascade.slower > 1:  # nothing off the set is tried
         figures = known["figures"] | {"set": known["own"].value, "set_shift": list(held)}
@@ -152,16 +148,16 @@ def _survives(problem: DriveProblem, design: DriveDesign, survived: Survival | N
         state = states.get(known["own"], State.UNKNOWN)
         return Check("survives", state, tuple(known["own_findings"]), figures)
     known["figures"] |= {"set_shift": list(held)}
-    return survives(survived, S_max=problem.bounds.S_max, **known)
+    return survives(ranges, S_max=problem.bounds.S_max, **known)
 
 
-def _deployable(problem: DriveProblem, design: DriveDesign, survived: Survival | None) -> Check:
+def _deployable(problem: DriveProblem, design: DriveDesign, ranges: Survival | None) -> Check:
     rate, between = problem.sampling, design.between
     figures = {"rate_hz": rate.rate_hz, "delay_us": rate.delay_us}
     words = f"judged at {rate.rate_hz:g} Hz with a delay of {rate.delay_us:g} us, "
     words += "hold and delay exact; cascade.c is its code"
     line = partial(Check, "deployable", figures=figures)
-    if not design.certificate.passed or (survived and survived.contradiction):
+    if not design.certificate.passed or (ranges and ranges.contradiction):
         return line(State.UNKNOWN, (Reason.JUDGED(words="the loop is not certified"),))
     if between is None:
         words = f"S between its samples is not judged; {words}"
