@@ -253,9 +253,9 @@ class DriveTable:
         unit="mm",
         check=checks.coordinate,
     )
-    coil: tuple[float, ...] = key(
+    coil: tuple[float, ...] | None = key(
         "ohm, H, Hz: designs the current controller",
-        (),
+        None,
         check=checks.every(checks.POSITIVE, "give three numbers above 0: ohm, H, Hz", 3, 3),
     )
     position_rate_hz: float | None = key(
