@@ -248,10 +248,7 @@ class DriveTable:
     )
     velocity: str | None = key("channel of the motor's sensor; absent: the position's", None)
     lead_mm: float | str | None = key(
-        "of a rotary motor's screw; number or [theta]",
-        None,
-        unit="mm",
-        check=checks.coordinate,
+        "of a rotary motor's screw; number or [theta]", None, unit="mm", check=checks.coordinate
     )
     coil: tuple[float, ...] | None = key(
         "ohm, H, Hz: designs the current controller",

@@ -55,7 +55,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         raise UserError("--theta fixes what --codesign searches; give one of both")
     problem = drive_problem(case, theta)
     drive = problem.cascade.drive
-    own_settings = *problem.cascade.settings, drive.speed_feedforward, drive.force_feedforward
+    own_settings = (
+        *problem.cascade.settings, *(setting for setting, _ in problem.cascade.current),
+        drive.speed_feedforward, drive.force_feedforward,
+    )  # fmt: skip
     known = [(one.number, one.name) for one in own_settings if one]
     if strange := [name for name in today or {} if not any(name in pair for pair in known)]:
         own = ", ".join(number or name for number, name in known)
