@@ -22,7 +22,7 @@ from typing import Any
 from ccd_casadi.cases.case import Case, parse_case, read_toml
 from ccd_casadi.extensions.drives.drive_case import drive_problem
 from ccd_casadi.extensions.drives.drive_design import design_drive
-from ccd_casadi.extensions.drives.sheet import proof_words
+from ccd_casadi.extensions.drives.drive_verdict import verdict_entry
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
@@ -88,7 +88,7 @@ def main(names: list[str]) -> None:
             print(f"{name:26s}{error}", flush=True)
             continue
         hz, seconds = [one.bandwidth / HZ for one in (found.free, found)], perf_counter() - started
-        end = f"{found.status}, {proof_words(found)}  {seconds:.0f} s"
+        end = f"{verdict_entry(it, found)['status']}, {found.proof.words}  {seconds:.0f} s"
         print(f"{name:26s}{hz[0]:7.1f} Hz free {hz[1]:7.1f} rounded  {end}", flush=True)
 
 

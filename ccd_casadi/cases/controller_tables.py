@@ -248,9 +248,17 @@ class DriveTable:
     """
 
     name: str | None = key(
-        "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file like theirs (.toml)", None
+        "generic, sinamics_s120, beckhoff_ax5000, synapticon, or a file (.toml)", None
     )
-    velocity: str | None = key("channel of the motor's sensor; absent: that of the position", None)
+    velocity: str | None = key("channel of the motor's sensor; absent: the position's", None)
+    lead_mm: float | str | None = key(
+        "of a rotary motor's screw; number or [theta]", None, unit="mm", check=checks.coordinate
+    )
+    coil: tuple[float, ...] | None = key(
+        "ohm, H, Hz: designs the current controller",
+        None,
+        check=checks.every(checks.POSITIVE, "give three numbers above 0: ohm, H, Hz", 3, 3),
+    )
     position_rate_hz: float | None = key(
         "rate of a slower position loop",
         None,

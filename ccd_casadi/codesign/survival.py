@@ -196,13 +196,28 @@ Function = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Survival:
-    """Ranges as (low, high) around the model; relative shifts, factors of damping.
+    """What a loop survives off its model, and its margins.
 
     A range that ends at `reach` or `factors` of the options was not followed further. Margins are
-    the least of all loops broken one at a time at the plant's inputs: `gain` up and down as
-    factors, `phase_deg`, `delay` in s, and `modulus` = 1/‖S‖∞. `unstable_poles_hz`: |p|/2π of the
-    controller's poles in the right half plane. `contradiction`: what this engine finds on the model
-    itself that the certificate denies.
+    the least of all loops broken one at a time at the plant's inputs.
+
+    Attributes
+    ----------
+    stable_shift, S_max_shift : (float, float)
+        Ranges of relative shifts around the model.
+    stable_damping : (float, float)
+        Range of the factor of damping.
+    gain : (float, float)
+        Factors down and up.
+    phase_deg, delay, modulus : float
+        deg, s, and 1/‖S‖∞.
+    unstable_poles_hz : tuple of float
+        |p|/2π of the controller's poles in the right half plane.
+    statics : Statics
+    contradiction : Finding or None
+        What this engine finds on the model itself that the certificate denies.
+    S_max_slack : float
+        Relative: by what ‖S‖∞ may exceed S_max within `S_max_shift`.
     """
 
     stable_shift: tuple[float, float]
@@ -215,7 +230,7 @@ class Survival:
     unstable_poles_hz: tuple[float, ...]
     statics: Statics
     contradiction: Finding | None = None
-    S_max_slack: float = PEAK  # relative: by what ‖S‖∞ may exceed S_max within `S_max_shift`
+    S_max_slack: float = PEAK
 
     def within(self, low: float, high: float) -> bool:
         """Whether S_max holds for all resonance shifts from `low` to `high`."""
@@ -417,7 +432,7 @@ def survival(
         loops, partial(shift_range, loops, marks=marks), S_max, slack, held
     )
     margins = least_of([least_margins(one.responses, one.grid()) for one in nominal.places])
-    poles = np.linalg.eigvals(loops.controller.A)
+    poles = loops.controller.rates
     sizes = np.abs(poles)  # of an integrator rounding alone
     size = np.maximum(1e-9 * sizes, StaticsOptions().integrator * bandwidth)
     unstable = poles[(poles.real > size) & (poles.imag >= 0.0)]

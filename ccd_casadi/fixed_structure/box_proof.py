@@ -196,10 +196,14 @@ class ProofOutcome(StrEnum):
         "was searched"
     )
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
+    AS_RUN = (
+        "two rates, lags of actuators or sensors, or more than three parameters are not enclosed, "
+        "so the set was searched"
+    )
 
 
 NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.FIRST_ORDER,
-                  ProofOutcome.WIRED, ProofOutcome.VARIES)  # fmt: skip
+                  ProofOutcome.WIRED, ProofOutcome.VARIES, ProofOutcome.AS_RUN)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -219,8 +223,8 @@ class Proof:
     option, point, passed : int, tuple of float, (str, float)
         Of a refuted box: where, which bound and the least factor by which it is exceeded there, by
         an enclosure and not by a sample.
-    channels : bool
-        Whether single channels have bounds, which no proof is of.
+    left : str
+        Which bounds the proof is not of, in words; empty: of every bound.
     """
 
     outcome: ProofOutcome
@@ -231,7 +235,7 @@ class Proof:
     option: int = 0
     point: tuple[float, ...] = ()
     passed: tuple[str, float] = ("", np.nan)
-    channels: bool = False
+    left: str = ""
 
     @property
     def proven(self) -> bool:
@@ -261,9 +265,7 @@ class Proof:
     @property
     def unasked(self) -> str:
         """Why the proof does not apply, or is not of every bound; empty where it is of all."""
-        if not self.applies:
-            return self.outcome.value
-        return "bounds of single channels are judged, not proven" if self.channels else ""
+        return self.left if self.applies else self.outcome.value
 
     @property
     def unclosed(self) -> bool:
@@ -291,7 +293,7 @@ class Proof:
             return (f"the proof denies it: {self.outcome.value}",)
         if not self.stable:
             return (f"searched, not proven: {self.outcome.value}",)
-        left = (self.unasked,) if self.channels else ()
+        left = (self.left,) if self.left else ()
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
             over = [
@@ -389,7 +391,8 @@ def prove(
         share, enough = min(share, options.most_boxes_of_many), options.stuck_boxes_of_many
     proof = divide(families, uncertain.box, slack, share, workers, enough, options)
     # where sensors share an actuator every place is enclosed
-    return replace(proof, channels=bounds.error is None and any(c.given for c in bounds.channels))
+    single = bounds.error is None and any(c.given for c in bounds.channels)
+    return replace(proof, left="bounds of single channels are judged, not proven" if single else "")
 
 
 def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.ndarray | None:

@@ -86,7 +86,20 @@ def head_of(
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
-    """The head of a page that is about the run itself: badge and verdict are the run's."""
+    """Make the head of a page that is about the run itself: badge and verdict are the run's.
+
+    Parameters
+    ----------
+    title : str
+    result : mapping
+        Of result.json.
+    meta, lead : str
+        As `head_of` takes them.
+
+    Returns
+    -------
+    Head
+    """
     good = result["status"] == "verified"
     failed = [name for name, held in result.get("checks", {}).items() if held is False]
     failed = failed or [line.name for line in lines_of(result) if line.state == State.FAILED]

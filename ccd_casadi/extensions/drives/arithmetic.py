@@ -21,6 +21,7 @@ from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.drive_data import Number
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.text import template
 
 
 @dataclass(frozen=True)
@@ -111,10 +112,6 @@ class Program:
         return step
 
     @property
-    def _often(self) -> str:
-        return "" if self.slower == 1 else f"; the position is read at every {self.slower}th call"
-
-    @property
     def _fixed(self) -> bool:
         return self.kind is Number.FIXED_30
 
@@ -132,133 +129,46 @@ class Program:
     def code(self, title: str) -> str:
         """The same as one C99 file: `cascade_step(state, r, y, m)`."""
         real = "float" if self.real is np.float32 else "double"
-        number = "int64_t" if self._fixed else real
-        suffix = "f" if real == "float" else ""
 
         def value(x: Any) -> str:
-            return str(int(x)) if self._fixed else f"{float(x)!r}{suffix}"
+            return f"{float(x)!r}{'f' if real == 'float' else ''}"
 
-        rows = [f"    {{{', '.join(map(value, own))}}}" for own in (*self.setpoint, *self.current)]
-        count, n = len(rows), len(self.setpoint)
-        inside = ("x = u", "c[0] * x + c[1] * s[0] + c[2] * s[1] - c[3] * s[2] - c[4] * s[3]", "y")
-        if self._fixed:  # of a whole product 64 bits hold no more than 8 kN
-            half = self.options.bits // 2
-            inside = ("x = llrint(u / GRAIN)",
-                      f"(PRODUCTS(>> {half}) + (PRODUCTS(& {2**half - 1}) >> {half})) >> {half}",
-                      "(real)(y * GRAIN)")  # fmt: skip
-        gains = [
-            f"{float(g)!r}{suffix}"
-            for g in (self.Kv, self.Kp, self.share, self.rate, self.ahead, self.push)
-        ]
-        return f"""/* {title}: position, velocity and filters of a drive,
-   one call each period{self._often}.
-   cc -std=c99 -O2 -ffp-contract=off; right shifts of negative integers are arithmetic. */
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
-
-#define GRAIN {self.options.grain!r}
-#define PRODUCTS(part) ((c[0] part) * x + (c[1] part) * s[0] + (c[2] part) * s[1] \\
-    - (c[3] part) * s[2] - (c[4] part) * s[3])
-typedef {real} real;
-typedef {number} number;
-typedef struct {{
-    real last, total, held, before, speed;
-    int begun, call;
-    number old[{max(count, 1)}][4];
-}} cascade_state;
-
-static const number FILTERS[{max(count, 1)}][5] = {{
-{("," + chr(10)).join(rows) or "    {0}"}
-}};
-
-static real filtered(const number *c, number *s, real u)
-{{
-    number {inside[0]};
-    number y = {inside[1]};
-    s[1] = s[0]; s[0] = x; s[3] = s[2]; s[2] = y;
-    return {inside[2]};
-}}
-
-void cascade_reset(cascade_state *s) {{ memset(s, 0, sizeof *s); }}
-
-/* r, y: setpoint and sensor of the position, m: the motor's sensor, m; the force, N. */
-real cascade_step(cascade_state *s, real r, real y, real m)
-{{
-    real v, w, u, fast;
-    int i;
-    if (s->call == 0) s->held = {gains[0]} * (r - y);
-    s->call = (s->call + 1) % {self.slower};
-    if (!s->begun) {{ s->last = m; s->before = r; s->begun = 1; }}
-    fast = (r - s->before) * {gains[3]};
-    s->before = r;
-    v = s->held + {gains[4]} * fast;
-    for (i = 0; i < {n}; i++) v = filtered(FILTERS[i], s->old[i], v);
-    w = v - (m - s->last) * {gains[3]};
-    s->last = m;
-    s->total = s->total + {gains[2]} * w;
-    u = {gains[1]} * (w + s->total) + {gains[5]} * (fast - s->speed);
-    s->speed = fast;
-    for (i = {n}; i < {count}; i++) u = filtered(FILTERS[i], s->old[i], u);
-    return u;
-}}
-"""
+        filters = (*self.setpoint, *self.current)
+        gains = ("Kv", "Kp", "share", "rate", "ahead", "push")
+        return template("extensions/drives/templates/cascade.c").render(
+            title=title, slower=self.slower, real=real, number="int64_t" if self._fixed else real,
+            grain=repr(self.options.grain), half=self.options.bits // 2, count=len(filters),
+            rows=[[str(int(x)) if self._fixed else value(x) for x in row] for row in filters],
+            setpoint=len(self.setpoint), **{name: value(getattr(self, name)) for name in gains},
+        )  # fmt: skip
 
 
 def program_of(
     cascade: Cascade, values: Array, ahead: tuple[float, float] = (0.0, 0.0),
     options: ArithmeticOptions = ArithmeticOptions(),
 ) -> Program:  # fmt: skip
-    """The program of a cascade with rounded values.
-
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI.
-    ahead : (float, float)
-        f, and m in kg; 0: no feedforward.
-    options : ArithmeticOptions
-
-    Returns
-    -------
-    Program
-    """
+    """The program of a cascade with rounded values (SI); `ahead`: f, and m in kg."""
     kind = cascade.drive.number
     real = np.float32 if kind is Number.SINGLE else float
-    own: dict[str, list[tuple[Any, ...]]] = {"setpoint": [], "current": []}
-    for slot, block, part in zip(cascade.slots, cascade.filters, cascade.parts(values),
-                                 strict=True):  # fmt: skip
-        b, a = block.coefficients(part)
-        numbers = [*b.tolist(), *a[1:].tolist()]
-        if kind is Number.FIXED_30:
-            own[slot.place].append(tuple(round(c * 2**options.bits) for c in numbers))
-        else:
-            own[slot.place].append(tuple(real(c) for c in numbers))
+
+    def held(c: float) -> Any:
+        return round(c * 2**options.bits) if kind is Number.FIXED_30 else real(c)
+
+    own = {place: tuple(tuple(map(held, (*b.tolist(), *a[1:].tolist()))) for b, a in each)
+           for place, each in cascade.coefficients(values).items()}  # fmt: skip
     Kv, Kp, Tn = (float(value) for value in values[:3])
     share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
     return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
-                   tuple(own["setpoint"]), tuple(own["current"]), options,
+                   own["setpoint"], own["current"], options,
                    cascade.slower, float(real(ahead[0])),
                    float(real(ahead[1] / cascade.period)))  # fmt: skip
 
 
 def following_error(program: Program, plant: StateSpace, position: int, velocity: int) -> float:
-    """Simulate a move and find how far the position is behind its setpoint at most.
+    """How far in m the position is behind its setpoint at most, in a simulated move.
 
-    The setpoint is the polynomial of seventh order from rest to rest. Sensors are exact.
-
-    Parameters
-    ----------
-    program : Program
-    plant : StateSpace
-        From force to all sensors at the program's rate (`lti.loop.sampled`).
-    position, velocity : int
-        Numbers of the sensors.
-
-    Returns
-    -------
-    float
-        m.
+    The setpoint is the polynomial of seventh order from rest to rest; sensors are exact. `plant`:
+    from force to all sensors at the program's rate; `position`, `velocity`: their numbers.
     """
     o, step, x, worst = program.options, program.started(), np.zeros(len(plant.A)), 0.0
     for k in range(round((o.seconds + o.rest) * program.rate)):

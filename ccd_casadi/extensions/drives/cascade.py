@@ -7,7 +7,7 @@ of its counts. F_s are filters of the velocity setpoint, F_c those of the curren
 K = [K_p, K_m] both sensors' gains are tied by the same PI and filters.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.drives.drive_data import FORMS, Drive, Filter, Setting, Slot
+from ccd_casadi.extensions.drives.drive_data import FORMS, PLACES, Drive, Filter, Setting, Slot
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -55,6 +55,8 @@ class Cascade:
         N: the position's error is read at every N-th instant, and held between (`two_rates`).
     stiff_below : float
         rad/s up to which compliance_max holds.
+    current : tuple of (Setting, float)
+        Of a designed current loop (`drive_case`), SI.
     """
 
     drive: Drive
@@ -68,6 +70,7 @@ class Cascade:
     decay: float = 4.0
     slower: int = 1
     stiff_below: float = np.inf
+    current: tuple[tuple[Setting, float], ...] = ()
 
     @cached_property
     def settings(self) -> tuple[Setting, ...]:
@@ -130,16 +133,14 @@ class Cascade:
         slopes = np.zeros((2, n, len(z)), complex)  # of ln of the motor's path, and the position's
         slopes[1, 0] = slopes[:, 1] = 1.0
         slopes[:, 2] = -lag / (1.0 + lag)
-        ahead, at = np.ones(len(z), complex), 3
-        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
-            F, steep = block.response(own, z)
-            slopes[1, at : at + len(steep)] = steep
-            if slot.place == "current":
+        ahead = np.ones(len(z), complex)
+        for place, at, F, steep in self._filtered(values, z):
+            slopes[1, at] = steep
+            if place == "current":
                 base = base * F
-                slopes[0, at : at + len(steep)] = steep
+                slopes[0, at] = steep
             else:
                 ahead = ahead * F
-            at += len(steep)
         K, dK = np.zeros((self.sensors, len(z)), complex), np.zeros((n, self.sensors, len(z)),
                                                                     complex)  # fmt: skip
         paths = base * away / self.period, base * ahead * Kv * held
@@ -148,29 +149,40 @@ class Cascade:
             dK[:, sensor] += path * steep
         return K, dK
 
+    def _filtered(
+        self, values: Values, z: np.ndarray
+    ) -> Iterator[tuple[str, slice, np.ndarray, np.ndarray]]:
+        """Of every filter its place, where its values are, F (k,) and ∂ln F/∂ln values (n, k)."""
+        at = 3
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            F, steep = block.response(own, z)
+            yield slot.place, slice(at, at + len(steep)), F, steep
+            at += len(steep)
+
     def rises(self, values: Values, z: np.ndarray) -> tuple[Array, Array]:
         """ln of the gain of all filters behind the motor's sensor and behind the position's (2, k),
         and its slopes to ln values (n, 2, k)."""
         found, slopes = np.zeros((2, len(z))), np.zeros((len(self.settings), 2, len(z)))
-        at = 3
-        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
-            F, steep = block.response(own, z)
-            ways = slice(0, 2) if slot.place == "current" else slice(1, 2)
+        for place, at, F, steep in self._filtered(values, z):
+            ways = slice(0, 2) if place == "current" else slice(1, 2)
             found[ways] += np.log(np.abs(F))
-            slopes[at : at + len(steep), ways] += steep.real[:, None]
-            at += len(steep)
+            slopes[at, ways] += steep.real[:, None]
         return found, slopes
+
+    def coefficients(self, values: Values) -> dict[str, list[tuple[Array, Array]]]:
+        """b and a of the filters at each place, as the drive rounds them."""
+        found: dict[str, list[tuple[Array, Array]]] = {place: [] for place in PLACES}
+        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
+            found[slot.place].append(block.coefficients(own))
+        return found
 
     def polynomials(self, values: Values) -> Polynomials:
         """K with its coefficients as the drive rounds them."""
         Kv, Kp, Tn = (float(value) for value in values[:3])
         PI = Kp * np.array([1.0 + self.period / Tn, -1.0])
-        above: dict[str, list[Array]] = {"current": [], "setpoint": []}
-        below: dict[str, list[Array]] = {"current": [], "setpoint": []}
-        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
-            b, a = block.coefficients(own)
-            above[slot.place].append(b)
-            below[slot.place].append(a)
+        used = self.coefficients(values)
+        above = {place: [b for b, _ in each] for place, each in used.items()}
+        below = {place: [a for _, a in each] for place, each in used.items()}
         return Polynomials(
             (Kv * PI, *above["current"], *above["setpoint"]),
             (PI / self.period, *above["current"], *below["setpoint"]),
@@ -181,9 +193,8 @@ class Cascade:
         """K(z), errors of all sensors in, force out, coefficients as the drive rounds
         them; of a slower position loop e as it is held."""
         (Kv, Kp, Tn), T = map(float, values[:3]), self.period
-        blocks = {"current": [], "setpoint": []}  # type: dict[str, list[StateSpace]]
-        for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
-            blocks[slot.place].append(_second_order(*block.coefficients(own), T))
+        blocks = {place: [_second_order(b, a, T) for b, a in each]
+                  for place, each in self.coefficients(values).items()}  # fmt: skip
         sensor = np.eye(self.sensors)
         reads, none = sensor[[self.velocity]], np.zeros((1, 0))
         position = StateSpace(none[:0], sensor[:0], none, Kv * sensor[[self.position]], period=T)

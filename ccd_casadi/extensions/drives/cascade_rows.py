@@ -124,18 +124,8 @@ class BoundedFigure(NamedTuple):
 
 
 def split(plant: StateSpace, cascade: Cascade) -> tuple[StateSpace, Array, Array]:
-    """Take apart a plant with its ports: from the drive's force to the sensors, where forces act,
-    and what counts; without ports the drive's force itself, and the position's sensor.
-
-    Parameters
-    ----------
-    plant, cascade : StateSpace, Cascade
-
-    Returns
-    -------
-    sensed : StateSpace
-    drive, counted : array (n, q), (z, n)
-    """
+    """Take apart a plant with its ports: from the drive's force to the sensors, where forces act
+    (n, q), and what counts (z, n); without ports the drive's force, and the position's sensor."""
     p = cascade.sensors
     drive = plant.B[:, 1:] if plant.B.shape[1] > 1 else plant.B
     counted = plant.C[p:] if len(plant.C) > p else plant.C[[cascade.position]]

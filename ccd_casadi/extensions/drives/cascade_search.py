@@ -168,20 +168,7 @@ class RoundingOptions:
 def on_the_grid(
     search: Search, candidate: Candidate, options: RoundingOptions = RoundingOptions()
 ) -> Candidate:
-    """Put every value on the drive's grid.
-
-    Parameters
-    ----------
-    search : Search
-        Whose plants, bounds and frequencies count.
-    candidate : Candidate
-    options : RoundingOptions
-
-    Returns
-    -------
-    Candidate
-        ω_b and the largest excess on the search's grid, of values on the drive's.
-    """
+    """Put every value on the drive's grid; ω_b and the excess are on the search's plants."""
     settings = search.cascade.settings
     values, band = candidate.values.copy(), candidate.bandwidth
     coarse = np.array([setting.step / (value * setting.per_si)

@@ -8,9 +8,9 @@ import numpy as np
 from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.case_problem import plain_case, problem_of
 from ccd_casadi.cases.checks import CaseError
-from ccd_casadi.cases.controller_tables import DriveTable
+from ccd_casadi.cases.controller_tables import DriveTable, FiltersTable
 from ccd_casadi.extensions.drives.cascade import Cascade
-from ccd_casadi.extensions.drives.drive_data import Slot, read_drive
+from ccd_casadi.extensions.drives.drive_data import Drive, Setting, Slot, read_drive
 from ccd_casadi.extensions.drives.drive_design import require_known
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -37,22 +37,7 @@ class DriveProblem:
 
 
 def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProblem:
-    """The problem of a case at a θ, or at its start.
-
-    Parameters
-    ----------
-    case : Case
-    theta : sequence of float, optional
-
-    Returns
-    -------
-    DriveProblem
-
-    Raises
-    ------
-    UserError
-        What does not go with a drive.
-    """
+    """The problem of a case at a θ, or at its start; UserError: what does not go with a drive."""
     table = case.drive
     if table.name is None:
         words = "drive.name: is missing; add a table [drive] with the drive's name"
@@ -63,7 +48,12 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             words = f"{drive.title} has no cascade; its PID is not designed yet"
             raise UserError(f"{words}: use `ccd tune`, or another drive")
         most = case.inner.compliance_max
-        problem = problem_of(plain_case(case))
+        plain, current = plain_case(case), tuple[tuple[Setting, float], ...]()
+        if table.coil:
+            if case.actuator != FiltersTable():
+                raise UserError("coil designs what [actuator] states; give one of both")
+            plain, current = _with_current_loop(plain, drive, table.coil)
+        problem = problem_of(plain)
         if not isinstance(problem.controller, StructuredProblem):
             raise UserError('controller.structure is not "sections"; a drive needs that')
         if problem.sampling is None:
@@ -71,6 +61,9 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         if most is None:
             refuse_ports(problem, "[drive] without inner.compliance_max")
         bounds = replace(bounds_of(problem), compliance_max=most)
+        at = problem.start if theta is None else tuple(theta)
+        if (travel := _travel(table.lead_mm, problem, at)) is not None:
+            drive = drive.behind_screw(travel)
         filters: list[Slot] = []
         for place, count in (("current", table.filters), ("setpoint", table.setpoint_filters)):
             there = drive.places(place)
@@ -82,9 +75,8 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
         cascade = Cascade(drive, problem.sampling.period, tuple(filters), position, velocity, count,
                           table.filter_gain, table.filters_above, table.decay,
                           _slower(table, problem.sampling, bounds.omega_low),
-                          HZ * (table.compliance_hz or np.inf))  # fmt: skip
+                          HZ * (table.compliance_hz or np.inf), current)  # fmt: skip
         require_known(cascade, bounds)
-        at = problem.start if theta is None else tuple(theta)
         uncertain, ported = uncertain_plant(problem, at), None
         if most is not None:
             ported = uncertain_plant(with_ports(problem), at)
@@ -97,6 +89,44 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
     except UserError as error:
         raise CaseError(f"{case.path}: drive: {error}") from None
     return DriveProblem(problem, at, cascade, uncertain, bounds, problem.sampling, ported)
+
+
+def _with_current_loop(
+    case: Case, drive: Drive, coil: Sequence[float]
+) -> tuple[Case, tuple[tuple[Setting, float], ...]]:
+    """The case with the loop of a current controller as its actuator, and the controller.
+
+    By the magnitude optimum Kp = L/(2σ), Tn = L/R, σ = 1.5 of its periods: one to compute, a half
+    of the hold. Tn cancels the coil's pole; with Kp as it is rounded, σ as a lag, and without the
+    motor's EMF, the current follows as 1/(1 + sL/Kp (1 + σs)).
+    """
+    R, L, rate = coil
+    gain, time = drive.current, drive.current_integral
+    if gain is None or time is None:
+        raise UserError(f"{drive.title} has no parameters of a current controller; drop coil")
+    sigma = 1.5 / rate
+    Kp, Tn = gain.rounded(L / (2.0 * sigma)), time.rounded(L / R)
+    if not Kp > 0.0 or abs(Tn * R / L - 1.0) > 0.05:
+        words = f"coil needs Kp {L / (2.0 * sigma):g} V/A and Tn {L / R:g} s"
+        raise UserError(f"{words}, which the drive has not; correct it, or give [actuator] instead")
+    omega = np.sqrt(Kp / (L * sigma))
+    lag = FiltersTable(second_order_hz=float(omega / HZ), damping=float(0.5 / (sigma * omega)))
+    return replace(case, actuator=lag), ((gain, Kp), (time, Tn))
+
+
+def _travel(
+    lead: float | str | None, problem: CoDesignProblem, theta: Sequence[float]
+) -> float | None:
+    """m of travel per rad of a rotary motor; None of a linear one."""
+    if lead is None:
+        return 1.0 if problem.spoken[0] == "rad" else None
+    if isinstance(lead, str):
+        if dict(zip(problem.names, problem.units, strict=True)).get(lead) != "mm":
+            raise UserError(f"lead_mm is {lead!r}; give a number, or the name of a [theta] in mm")
+        lead = dict(zip(problem.names, theta, strict=True))[lead]
+    if not lead > 0.0 or problem.spoken[0] == "rad":
+        raise UserError(f"lead_mm is {lead:g}; give mm above 0 per turn, of a plant in m")
+    return 1e-3 * lead / HZ
 
 
 def _slower(table: DriveTable, sampling: Sampling, omega_low: float) -> int:

@@ -85,27 +85,10 @@ def codesign_drive(
     drive: DriveProblem, seed: int = 0, progress: Tell = silent,
     options: DriveCodesignOptions = DriveCodesignOptions(),
 ) -> tuple[DriveAt, DriveAt]:  # fmt: skip
-    """Find the best θ for a drive's cascade.
+    """Find the best θ for a drive's cascade, from the case's start, which has to have one.
 
-    Parameters
-    ----------
-    drive : DriveProblem
-        At the case's start, whose values have to be a design.
-    seed : int
-    progress : callable
-        Takes a line at each θ.
-    options : DriveCodesignOptions
-
-    Returns
-    -------
-    DriveAt, DriveAt
-        At the start, and at the best θ.
-
-    Raises
-    ------
-    UserError
-        No cascade meets the bounds at the start, no θ that was tried meets the constraints, or J
-        counts another figure than ω_b.
+    Raises UserError where no θ that was tried has a cascade and meets the constraints, or J counts
+    another figure than ω_b. Returns what is at the start, and at the best θ.
     """
     problem = drive.problem
     require_bandwidth(problem, "ccd drive --codesign")
@@ -119,7 +102,7 @@ def codesign_drive(
     free = [i for i, name in enumerate(problem.names)
             if name not in listed and problem.upper[i] > problem.lower[i]]  # fmt: skip
     lower, upper = np.array(problem.lower)[free], np.array(problem.upper)[free]
-    tried, allowed = 0, _met(problem, problem.start, options)
+    tried, allowed = 0, meets_constraints(problem, problem.start, options)
     for chosen in itertools.product(*lists):
 
         def theta_of(share: Array, chosen: Sequence[float] = chosen) -> tuple[float, ...]:
@@ -136,7 +119,7 @@ def codesign_drive(
             if (
                 found is not None
                 and (found.objective < best.objective or not allowed)
-                and _met(problem, theta, options)
+                and meets_constraints(problem, theta, options)
             ):
                 allowed = True
                 best = found
@@ -146,7 +129,7 @@ def codesign_drive(
 
         begin = (np.array(best.theta)[free] - lower) / (upper - lower)
         if not free:
-            if _met(problem, theta_of(begin), options):
+            if meets_constraints(problem, theta_of(begin), options):
                 objective(begin)
             continue
         limits = NonlinearConstraint(
@@ -162,7 +145,11 @@ def codesign_drive(
     return first, best
 
 
-def _met(problem: CoDesignProblem, theta: Sequence[float], options: DriveCodesignOptions) -> bool:
+def meets_constraints(
+    problem: CoDesignProblem, theta: Sequence[float],
+    options: DriveCodesignOptions = DriveCodesignOptions(),
+) -> bool:  # fmt: skip
+    """Whether θ meets the constraints of the plant."""
     values = constraint_values(plant_of(problem), theta)
     return bool((values <= options.met).all())
 

@@ -32,13 +32,11 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.drives.drive_case import drive_problem
     from ccd_casadi.extensions.drives.drive_codesign import DriveCodesignOptions, codesign_drive
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
+    from ccd_casadi.extensions.drives.drive_page import drive_page
     from ccd_casadi.extensions.drives.sheet import (
         codesign_words,
-        drive_page,
         entry,
         figures_of,
-        move_errors,
-        proof_words,
         sheet_figures,
         sheet_text,
     )
@@ -57,7 +55,10 @@ def main(options: argparse.Namespace) -> ExitCode:
         raise UserError("--theta fixes what --codesign searches; give one of both")
     problem = drive_problem(case, theta)
     drive = problem.cascade.drive
-    own_settings = *problem.cascade.settings, drive.speed_feedforward, drive.force_feedforward
+    own_settings = (
+        *problem.cascade.settings, *(setting for setting, _ in problem.cascade.current),
+        drive.speed_feedforward, drive.force_feedforward,
+    )  # fmt: skip
     known = [(one.number, one.name) for one in own_settings if one]
     if strange := [name for name in today or {} if not any(name in pair for pair in known)]:
         own = ", ".join(number or name for number, name in known)
@@ -80,24 +81,20 @@ def main(options: argparse.Namespace) -> ExitCode:
             seed=options.seed, workers=workers, options=numbers, near=near,
             progress=lambda words: remark(words, options.quiet), ported=problem.ported,
         )  # fmt: skip
-    moved = move_errors(problem, found)
-    figures = sheet_figures(problem, found, moved)
-    text = sheet_text(found, figures, today)
+    run = {"seconds": options.seconds(), "seed": options.seed, "versions": versions()}
+    answer = entry(problem, found, today) | searched | run
+    figures = sheet_figures(problem, found, answer)
+    text = sheet_text(found, figures, answer, today)
     (folder / "sheet.txt").write_text(f"{text}\n", "utf-8")
     code = program_of(found.cascade, found.values, found.ahead).code(run_name(folder))
     (folder / "cascade.c").write_text(code, "utf-8")
-    run = {"seconds": options.seconds(), "seed": options.seed, "versions": versions()}
-    answer = entry(problem, found, today, moved) | searched | run
     write_json(folder / "drive.json", answer)
-    write_page(folder / "report.html", drive_page(run_name(folder), problem, found, figures, today))
+    page = drive_page(run_name(folder), problem, found, answer, figures, today)
+    write_page(folder / "report.html", page)
     if searched:
         text = f"{codesign_words(problem, searched['codesign'])}\n{text}"
     inform(text)
     inform(f"page          {folder / 'report.html'}")
-    if found.status == "verified":
-        return ExitCode.DONE
-    reason = proof_words(found) if found.certificate.passed else found.certificate.words
-    if found.rise > found.cascade.filter_gain:
-        reason = f"filters raise their gain to {found.rise:.4g}, above filter_gain"
-    say(one_line(f"not verified: {reason}"), sys.stderr)
-    return ExitCode.NOT_VERIFIED
+    if answer["reason"]:
+        say(one_line(f"not verified: {answer['reason']}"), sys.stderr)
+    return ExitCode.of(answer["status"])

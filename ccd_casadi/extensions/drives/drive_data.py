@@ -13,7 +13,7 @@ damping D or of first order without one:
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, ClassVar
@@ -160,6 +160,8 @@ class Setting:
         In the drive's words; the number is empty where no stored manual has it.
     per_si : float
         Its value per SI (1/s, N s/m, s, Hz).
+    rotary : str
+        Its unit where a rotary motor counts (N m s/rad, kg m²): `behind_screw`.
     step : float
         Of its grid, in its unit.
     least, most : float
@@ -173,6 +175,7 @@ class Setting:
     unit: str = ""
     number: str = ""
     per_si: float = 1.0
+    rotary: str = ""
 
     def rounded(self, value: float, by: int = 0) -> float:
         """The nearest grid value in SI, `by` steps beside it, within the limits."""
@@ -217,6 +220,8 @@ class Drive:
         Filters, in the order in which they are used.
     speed_feedforward, force_feedforward : Setting or None
         Of the setpoint's velocity, 1 for all of it, and of its acceleration, kg.
+    current, current_integral : Setting or None
+        Gain of the current controller in V/A, and its integral time in s.
     sources, chosen, unknown : tuple of str
         What manuals say, what is this file's choice, and what no manual was found for.
     """
@@ -234,33 +239,31 @@ class Drive:
     unknown: tuple[str, ...]
     speed_feedforward: Setting | None = None
     force_feedforward: Setting | None = None
+    current: Setting | None = None
+    current_integral: Setting | None = None
 
     def places(self, place: str) -> tuple[Slot, ...]:
         """Its filters at a place."""
         return tuple(slot for slot in self.slots if slot.place == place)
+
+    def behind_screw(self, travel: float) -> "Drive":
+        """The drive of a rotary motor that moves the axis by `travel` m per rad: with T = F travel
+        and v = ω travel a gain of x N s/m is x travel² N m s/rad, and a mass an inertia alike."""
+        turned = {
+            name: replace(own, unit=own.rotary, per_si=own.per_si * travel**2)
+            for name in ("velocity", "force_feedforward")
+            if (own := getattr(self, name)) is not None
+        }
+        if not all(own.unit for own in turned.values()):
+            raise UserError(f"{self.title} has no units of a rotary motor; drop lead_mm")
+        return replace(self, **turned)
 
 
 PLACES = ("current", "setpoint")
 
 
 def read_drive(name: str, folder: Path = Path()) -> Drive:
-    """Read a drive's data file.
-
-    Parameters
-    ----------
-    name : str
-        One that ships with the package, or the path of a file, relative to `folder`.
-    folder : Path
-
-    Returns
-    -------
-    Drive
-
-    Raises
-    ------
-    UserError
-        There is none, or what is wrong in it.
-    """
+    """Read a drive that ships with the package, or the path of a file, relative to `folder`."""
     path = folder / name
     try:
         if name.endswith(".toml"):
@@ -292,7 +295,7 @@ def _drive(data: dict[str, Any]) -> Drive:
                            for key in ("sources", "chosen", "unknown")}  # fmt: skip
     for key in ("position", "velocity", "integral"):
         own[key] = _setting(key, data.pop(key))
-    for key in ("speed_feedforward", "force_feedforward"):
+    for key in ("speed_feedforward", "force_feedforward", "current", "current_integral"):
         own[key] = _setting(key, data.pop(key)) if key in data else None
     rule, number = Rule(data.pop("rule")), Number(data.pop("number"))
     if data["loop"] not in ("cascade", "pid"):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions, split
 from ccd_casadi.extensions.drives.cascade_search import (
@@ -17,9 +18,10 @@ from ccd_casadi.extensions.drives.drive_data import Setting
 from ccd_casadi.extensions.drives.proof import prove_cascade
 from ccd_casadi.extensions.drives.two_rates import judge_two_rates
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
 from ccd_casadi.lti.frequency_grid import local_maxima, zoomed
 from ccd_casadi.lti.loop import Loop, Sampling
@@ -43,9 +45,7 @@ class DriveOptions:
     Attributes
     ----------
     draws : int
-        Plants that are drawn for the judge besides the corners.
-    draws_unproven : int
-        The same of two rates and of what varies or moves by a force, of which there is no proof.
+        Plants that are drawn for the judge in each round, besides the corners.
     added : int
         Of these the worst that a round adds to the search's plants, at most.
     rounds : int
@@ -57,9 +57,8 @@ class DriveOptions:
     search, rounding : SearchOptions, RoundingOptions
     """
 
-    draws: int = 24
+    draws: int = 200
     rounds: int = 3
-    draws_unproven: int = 200
     added: int = 4
     lowered: int = 10
     lower: float = 1e-3
@@ -83,8 +82,12 @@ class DriveDesign:
         Before rounding.
     certificate : SetCertificate
         Of the rounded controller, on corners, draws and what the proof found.
-    proof : Proof or None
-        Of the rounded controller; None of two rates.
+    proof : Proof
+        Of the rounded controller.
+    worst : Excess
+        The worst of the judged plants.
+    drawn : Yield or None
+        Those that were drawn since the last change of the design; None where it is proven.
     compliance : float or None
         The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
     mass : float
@@ -98,7 +101,9 @@ class DriveDesign:
     bandwidth: float
     free: Candidate
     certificate: SetCertificate
-    proof: Proof | None
+    proof: Proof
+    worst: Excess
+    drawn: Yield | None = None
     compliance: float | None = None
     mass: float = 0.0
     between: BetweenSamples | None = None
@@ -119,18 +124,9 @@ class DriveDesign:
         return f, m
 
     @property
-    def status(self) -> str:
-        """verified: the judge passes it, and it is proven on the whole set, or judged on all of it
-        where the set is one plant."""
-        proven = self.one_plant if self.proof is None else self.proof.proven
-        proven &= self.one_plant or self.compliance is None
-        whole = self.certificate.passed and proven and self.rise <= self.cascade.filter_gain
-        return "verified" if whole else "not_verified"
-
-    @property
-    def one_plant(self) -> bool:
-        """Whether the set is one plant, of which nothing has to be proven."""
-        return len(self.certificate.plants) == 1
+    def certified(self) -> bool:
+        """Whether the judge passes it."""
+        return self.certificate.passed
 
     @property
     def rise(self) -> float:
@@ -181,8 +177,8 @@ def design_drive(
                                  near)  # fmt: skip
     of_S, wide = replace(bounds, compliance_max=None), ported or uncertain
     points: list[tuple[int, Array]] = []
-    new, unproven = first_points(uncertain), bool(uncertain.ranges) or wide is ported
-    draws = options.draws_unproven if unproven else options.draws
+    new = first_points(uncertain)
+    draws = options.draws if len(new) > 1 else 0
     progress(f"searching {options.search.starts} starts on {counted(len(new), 'plant')}")
     free = near
     for number in range(1, options.rounds + 1):
@@ -193,7 +189,8 @@ def design_drive(
             raise UserError(NO_CASCADE)
         progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
         rounded = on_the_grid(search, free, options.rounding)
-        tried = [*points, *uncertain.drawn(np.random.default_rng([seed, draws]), draws)]
+        # a round's draws are fresh: no search has seen them
+        tried = [*points, *uncertain.drawn(np.random.default_rng([seed, number, draws]), draws)]
         judged = judge(cascade, rounded.values, uncertain, of_S, sampling, tried, workers)
         moved = None if ported is None else moved_by_forces(
             cascade, rounded.values, ported.as_written(tried), sampling,
@@ -209,19 +206,27 @@ def design_drive(
             band *= 1.0 - options.lower
             proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
         new = [(proof.option, np.array(proof.point))] if proof.refuted else []
-        if unproven:
-            over = excesses(judged, bounds, rounded.bandwidth)
+        over = excesses(judged, bounds, rounded.bandwidth)
+        if ported is not None or not proof.conclusive:
             worst = np.argsort(-over)[: options.added]
             new += [tried[i] for i in worst if over[i] > options.lower and i >= len(points)]
         if not new:
             break
     assert free is not None
     cascade.require_fit(rounded.values)
-    most, between = None if moved is None else float(moved.max()), None
+    most = between = drawn = None
+    if moved is not None:
+        most = float(moved.max())
+        proof = replace(proof, left="compliance_max is judged, not proven")
+    over = excesses(judged, bounds, 0.0)  # ω_b is by definition the least of these plants
+    if draws and (most is not None or not proof.conclusive):
+        drawn = Yield(int(np.sum(over[-draws:] <= options.lower)), draws, number)
     if all(one.stable for one in judged.plants):
         K, peaks = cascade.state_space(rounded.values), [one.S_peak for one in judged.plants]
         between = worst_between(uncertain.as_written(tried), peaks, K, sampling, bounds.places)
-    return DriveDesign(cascade, rounded.values, band, free, judged, proof, most,
+    at = int(np.argmax(over))
+    return DriveDesign(cascade, rounded.values, band, free, judged, proof,
+                       Excess(*tried[at], float(np.log1p(over[at]))), drawn, most,
                        rigid_mass(uncertain, cascade.position), between)  # fmt: skip
 
 
@@ -232,10 +237,8 @@ def _design_two_rates(
     """Search with the part of a held error that has its frequency, judge by lifting; where that
     exceeds a bound, again with bounds that are tighter by as much."""
     points = first_points(uncertain)
-    drawn = []
-    if len(points) > 1:
-        drawn = uncertain.drawn(np.random.default_rng([seed, options.draws]),
-                                options.draws_unproven)  # fmt: skip
+    draws = options.draws if len(points) > 1 else 0
+    drawn = uncertain.drawn(np.random.default_rng([seed, draws]), draws)
     plants = plants_at(uncertain, [*points, *drawn])
     own = bounds
     for number in range(1, options.rounds + 1):
@@ -255,7 +258,9 @@ def _design_two_rates(
     assert free is not None
     cascade.require_fit(rounded.values)
     band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
-    return DriveDesign(cascade, rounded.values, band, free, judged, None,
+    worst = Excess(0, uncertain.nominal, float(np.log(max(judged.worst.values(), default=np.inf))))
+    return DriveDesign(cascade, rounded.values, band, free, judged,
+                       Proof(ProofOutcome.AS_RUN, 0.0, uncertain.names), worst,
                        mass=rigid_mass(uncertain, cascade.position))  # fmt: skip
 
 
@@ -344,17 +349,7 @@ def rigid_mass(uncertain: UncertainPlant, position: int) -> float:
 
 
 def first_points(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
-    """List the corners, and between the model and each of them half way.
-
-    Parameters
-    ----------
-    uncertain : UncertainPlant
-
-    Returns
-    -------
-    list of (int, array)
-        Options and points of the box.
-    """
+    """List options and points: the corners, and between the model and each of them half way."""
     corners = uncertain.corners()
     middle = uncertain.nominal
     between = [(option, 0.5 * (point + middle)) for option, point in corners

@@ -9,7 +9,8 @@ integrator are infinite. Where Δ has no zero on the circle for a connected set 
 one is stable, all are.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -89,26 +90,19 @@ class CascadeFamily(LoopFamily):
         return Enclosures(names, highest, lowest, spread, good)
 
 
-def _horner(row: list[Affine], w: Affine) -> Affine:
+def _horner(row: Sequence[Affine | float], w: Affine) -> Affine:
     """Σ row_k w^(n-k)."""
-    found = row[0]
+    found = w * 0.0 + row[0]
     for part in row[1:]:
         found = found * w + part
     return found
 
 
-def _polynomial(c: Array, turn: Affine) -> Affine:
-    """Σ c_k turn^k of exact coefficients."""
-    found = turn * 0.0 + float(c[-1])
-    for value in c[-2::-1]:
-        found = found * turn + float(value)
-    return found
-
-
 def _product(factors: tuple[Array, ...], turn: Affine) -> Affine:
+    """Π Σ c_k turn^k of exact coefficients."""
     found = turn * 0.0 + 1.0
-    for own in factors:
-        found = found * _polynomial(own, turn)
+    for c in factors:
+        found = found * _horner(c[::-1].tolist(), turn)
     return found
 
 
@@ -116,22 +110,7 @@ def prove_cascade(
     cascade: Cascade, values: Array, bandwidth: float, uncertain: UncertainPlant, bounds: Bounds,
     sampling: Sampling, options: BoxProofOptions | None = None,
 ) -> Proof:  # fmt: skip
-    """Prove bounds and stability of rounded values on the whole box.
-
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI.
-    bandwidth : float
-        ω_b, rad/s.
-    uncertain : UncertainPlant
-    bounds, sampling : Bounds, Sampling
-    options : BoxProofOptions, optional
-
-    Returns
-    -------
-    Proof
-    """
+    """Prove bounds and stability of rounded values (SI) at ω_b in rad/s on the whole box."""
     options = options or BoxProofOptions()
     K, names = cascade.state_space(values), uncertain.names
     slack, families = options.slack, []
@@ -143,7 +122,8 @@ def prove_cascade(
         unit = options.unit_frequency * max(bandwidth, fastest, bounds.omega_low)
         sampled = SampledModel(uncertain, option, sampling, unit)
         if not sampled.faithful:
-            return Proof(ProofOutcome.VARIES, slack, names)
+            outcome = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.AS_RUN
+            return Proof(outcome, slack, names)
         p, none = len(model.C), np.zeros(0)
         families.append(CascadeFamily(
             ModalSum(none, none.astype(bool), none, 0.0, none, none, none.astype(bool)), names, (),
@@ -152,5 +132,4 @@ def prove_cascade(
             sensors=(cascade.position, cascade.velocity),
         ))  # fmt: skip
     share = options.most_boxes // len(families)
-    found = divide([*families], uncertain.box, slack, share, None, None, options)
-    return replace(found, channels=False)
+    return divide([*families], uncertain.box, slack, share, None, None, options)

@@ -89,6 +89,14 @@ class LiftedLoop:
             return found
         return np.asarray(np.fmax(found, np.abs(np.linalg.eigvals(S)).max(axis=1)))
 
+    def grid(self, lowest: float) -> Array:
+        """ω in rad/s from `lowest` to half the velocity loop's rate, fine about its poles."""
+        top, poles, o = 0.999999 * np.pi / self.period, self.poles, TwoRateOptions()
+        near = root_flanks(poles[poles.imag > 0.0])
+        near = near[(near > lowest) & (near < top)]
+        even = np.linspace(lowest, top, o.points)
+        return np.unique([*np.geomspace(lowest, top, o.points), *even, *near])
+
     @property
     def radius(self) -> float:
         """The spectral radius of Φ over one instant, 1 at the limit of stability."""
@@ -104,19 +112,7 @@ class LiftedLoop:
 
 
 def lift(cascade: Cascade, values: Array, system: StateSpace) -> LiftedLoop:
-    """Lift the loop of a sampled plant.
-
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI.
-    system : StateSpace
-        From force to all sensors at the cascade's period (`lti.loop.sampled`).
-
-    Returns
-    -------
-    LiftedLoop
-    """
+    """Lift the loop of a plant from force to all sensors, sampled at the cascade's period."""
     one = cascade.position == cascade.velocity
     # the position's error, which is held, apart from the motor's
     K = replace(cascade, position=0, velocity=1, sensors=2).state_space(values)
@@ -182,20 +178,9 @@ def judge_two_rates(
     cascade: Cascade, values: Array, plants: Sequence[StateSpace], bounds: Bounds,
     sampling: Sampling, options: TwoRateOptions = TwoRateOptions(),
 ) -> SetCertificate:  # fmt: skip
-    """Judge a cascade of two rates on plants: stability, |S| at every place, S_low and ω_b.
+    """Judge a cascade of two rates on continuous plants: stability, |S| at every place, S_low, ω_b.
 
-    Parameters
-    ----------
-    cascade, values : Cascade, array (n,)
-        SI, as they are rounded.
-    plants : sequence of StateSpace
-        Continuous, SI.
-    bounds, sampling : Bounds, Sampling
-
-    Returns
-    -------
-    SetCertificate
-        `worst` has figures over their bounds by the names of the bounds.
+    `worst` of the certificate has figures over their bounds by the names of the bounds.
     """
     found = [_figures(lift(cascade, values, sampled(plant, sampling.period, sampling.delay)),
                       cascade, bounds, options) for plant in plants]  # fmt: skip
@@ -217,6 +202,13 @@ def judge_two_rates(
     return SetCertificate(passed, bandwidth, tuple(one for one, _ in found), worst, words)
 
 
+def place_name(bounds: Bounds, place: int | None) -> str:
+    """Name a place where the loop may be broken: its channel, or what there is without channels."""
+    if place is None:
+        return "actuator"
+    return bounds.channels[place].name if bounds.channels else "the sensor"
+
+
 def _figures(
     loop: LiftedLoop, cascade: Cascade, bounds: Bounds, options: TwoRateOptions
 ) -> tuple[PlantFigures, dict[str, float]]:
@@ -225,17 +217,11 @@ def _figures(
     if not radius < 1.0:
         return PlantFigures(stable=False, stability=radius - 1.0), {}
     own = {c.name: c.S_max or bounds.S_max for c in bounds.channels}
-    top = 0.999999 * np.pi / cascade.period
-    omega = np.geomspace(options.lowest * bounds.omega_low, top, options.points)
-    even, poles = np.linspace(0.0, top, options.points)[1:], loop.poles
-    near = root_flanks(poles[poles.imag > 0.0])
-    omega = np.unique([*omega, *even, *near[(near > 0.0) & (near < top)], bounds.omega_low])
+    omega = np.union1d(loop.grid(options.lowest * bounds.omega_low), bounds.omega_low)
     shares, S = {}, omega
     for place in loop.places:
-        found = loop.sensitivity(place, omega)
-        name = "actuator" if place is None else (
-            bounds.channels[place].name if bounds.channels else "")  # fmt: skip
-        key = f"S_MAX of {name}" if name else "S_MAX"
+        found, name = loop.sensitivity(place, omega), place_name(bounds, place)
+        key = f"S_MAX of {name}" if bounds.channels else "S_MAX"
         shares[key] = float(found.max()) / own.get(name, bounds.S_max)
         S = found if place == cascade.position else S
     peak, peak_at = float(S.max()), float(omega[S.argmax()])
@@ -243,7 +229,7 @@ def _figures(
     shares["S_LOW"] = float(S[np.searchsorted(omega, bounds.omega_low)]) / bounds.S_low
     below = omega < np.pi / (cascade.slower * cascade.period)  # above it the position is aliased
     crossed = np.flatnonzero(2.0 * S**2 > 1.0)
-    crossing = float(omega[crossed[0]]) if len(crossed) else top
+    crossing = float(omega[crossed[0]]) if len(crossed) else float(omega[-1])
     bandwidth = crossing if bounds.shape is None else float(
         (omega / bounds.reached(np.sqrt(2.0) * S))[below].min())  # fmt: skip
     figures = PlantFigures(S_peak=peak, S_peak_frequency=peak_at, bandwidth=bandwidth,
