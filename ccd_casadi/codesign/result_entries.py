@@ -115,9 +115,12 @@ def move_entry(
     cycle, own = motion.cycle, problem.source.motion
     times = np.maximum([move.settled for move in made], cycle.profile.duration)
     ahead = motion.forward_force(problem.sampling)
-    needed = max(float(cycle.peak_force), ahead, *(float(one.peak_force.max()) for one in made))
+    most, given = (max(float(getattr(one, of).max()) for one in made)
+                   for of in ("peak_force", "peak_command"))  # fmt: skip
+    commanded = {} if made[0].command is None else {"needed_command": max(ahead, given)}
+    needed = max(float(cycle.peak_force), most, 0.0 if commanded else ahead)
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
-    k, _, most = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
+    k, _, limit = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
@@ -132,9 +135,10 @@ def move_entry(
         **({} if own.motor is None else {
             "peak_current": cycle.peak_force / k,
             "needed_current": needed / k,
-            "needed_share": needed / (k * most)}),
+            "needed_share": needed / (k * limit)}),
         "feedforward_force": ahead,
         "needed_force": needed,
+        **commanded,  # before the actuators
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip
 

@@ -16,6 +16,7 @@ from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.gain_figures import of_plants
@@ -58,8 +59,9 @@ def move_blocks_of(
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        refused = ahead is None or problem.source.wiring  # by a [move]: on a spring, or filtered
-        own = "robustness takes another" if refused else "set your own under [move]"
+        own = "set your own under [move]"
+        if ahead is None:  # on a spring, which a [move] refuses
+            own = "robustness takes another"
         other = f"; {own}"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
@@ -157,7 +159,7 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, spoken("m")))
     step = f"y after a step of {spoken('1 N')} ({unit})"
     panel = c.Panel("time (ms)", step, curves, bands, marks=(mark,))
-    scalar = view.scalar and not loops[0].ported
+    scalar = view.scalar and loops[0].names == Loop.names
     words = paragraph("report.force", most, len(loops), scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
