@@ -376,6 +376,7 @@ def hardware_dict(found: OnHardware) -> dict[str, Any]:
                 "peak_error": move.peak_error,
                 "last_error": move.last_error(watched),
                 "peak_force": float(move.peak_force.max()),
+                "peak_command": float(move.peak_command.max()),
                 "saturated": move.saturated,
             }
             for words, move in found.ways.items()

@@ -67,9 +67,9 @@ def discs_of(
         factors, beside = [axis.factor(*pole) for pole in poles], axis.lagged_of(poles)
         _fill(held, i, rows, factors, least, strength, beside)
         if free:
-            own = [(axis.s.of(len(rows)) - p, N) for p, N in poles]
-            own = [axis.plain.factor(*pole) for pole in poles] if T is None else own
-            _fill(bare, i, rows, own, least if T is None else decay, strength)
+            plain = [(axis.s.of(len(rows)) - p, N) for p, N in poles]
+            plain = [axis.plain.factor(*pole) for pole in poles] if T is None else plain
+            _fill(bare, i, rows, plain, least if T is None else decay, strength)
     if q:  # where modes are not enclosed their parameters are divided before anything else
         held.shares[:, -q:] = np.where(known, held.shares[:, -q:], 1e30 * (high - low)[-q:])
     return held, bare if free else held, damped

@@ -287,8 +287,8 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         bare = replace(source, wiring=UNWIRED)
         plant = plant_from(bare, names, lower, upper)
         if source.wide:
-            own = plant_from(replace(bare, wide=False), names, lower, upper)
-            wiring = replace(wiring, own=(own.outputs, own.inputs))
+            narrow = plant_from(replace(bare, wide=False), names, lower, upper)
+            wiring = replace(wiring, own=(narrow.outputs, narrow.inputs))
         return with_wiring(plant, wiring)
     held = source.held
     if source.places is not None:

@@ -162,12 +162,12 @@ def with_wiring(plant: Plant, wiring: Wiring) -> Plant:
     def of(evaluate: Evaluate) -> Evaluate:
         def at(theta: Sequence[float]) -> Mechanics:
             found = evaluate(theta)
-            B, C, (*others, dB, dC) = found.B, found.C, found.derivatives
+            B, C, (dM, dD, dK, dB, dC) = found.B, found.C, found.derivatives
             if more_u:
                 B, dB = np.hstack([B, B]), np.concatenate([dB, dB], axis=2)
             if more_y:
                 C, dC = np.vstack([C, C]), np.concatenate([dC, dC], axis=1)
-            return replace(found, B=B, C=C, derivatives=(*others, dB, dC), wiring=wiring)
+            return replace(found, B=B, C=C, derivatives=(dM, dD, dK, dB, dC), wiring=wiring)
 
         return at
 

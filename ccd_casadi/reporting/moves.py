@@ -169,7 +169,7 @@ def move_blocks(found: "OnHardware") -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
     words = "Free bodies are free. Hold and delay are exact."
-    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
+    peak = max(float(move.peak_command.max()) for move in list(found.ways.values())[:2])
     limit = c.Words(paragraph("report.least_force", found, peak))
     return ways_figure(ways, words), limit
 
@@ -206,15 +206,18 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,), legend=None))
     lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    figures = dict(FIGURES)
+    if first.command is not None:
+        figures["peak command, N"] = lambda m: float(m.peak_command.max())
     rows = tuple(
-        (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()
+        (name, *(max(map(read, each)) for read in figures.values())) for name, each in ways.items()
     )
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
         f"{with_unit(first.window, spoken('m'))}. {words}"
     )
-    table = c.Table(("way", *map(spoken, FIGURES)), rows)
+    table = c.Table(("way", *map(spoken, figures)), rows)
     return c.Figure(lines, caption, (table, *tables_of(lines)))
 
 
