@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget
-from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget, member_loops
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.statics import compliance_words, statics
+from ccd_casadi.synthesis.statics import compliance_words, statics_of
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
 if TYPE_CHECKING:
@@ -66,21 +65,17 @@ def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> d
 def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design) -> dict[str, Any]:
     """A mixed-sensitivity design's figures, with compliance, margins and steps of a stable loop:
     these on the plant and those of its robust set."""
-    figures, plant = design.figures, scaled_plant(problem, theta)
+    figures = design.figures
     found = figures_dict(figures)
     if not figures.certified:
         return found
-    plants = [one.plant_si() for one in plant.members]
-    rest = statics(plants[0], design.controller, bandwidth=figures.bandwidth,
-                   omega_low=problem.inner.omega_low)  # fmt: skip
+    loops, low = member_loops(problem, theta, design.controller), problem.inner.omega_low
+    rest = statics_of(loops[0], bandwidth=figures.bandwidth, omega_low=low)
+    most = max(one.compliance for one in loops) if loops[0].ported else figures.compliance
     return (
         found
-        | loop_entry(
-            [Loop(one, design.controller) for one in plants],
-            figures.bandwidth,
-            figures.sensitivity_peak,
-        )
-        | compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
+        | loop_entry(loops, figures.bandwidth, figures.sensitivity_peak)
+        | compliance_dict(most, rest.compliance, rest.low, rest.low_hz)
     )
 
 
