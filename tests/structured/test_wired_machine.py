@@ -331,3 +331,36 @@ def test_what_is_not_known_behind_an_amplifier_is_named(
     (tmp_path / "case.toml").write_text(text.replace(old, new))
     with pytest.raises(CaseError, match=words):
         load_case(tmp_path / "case.toml")
+
+
+def test_of_two_sensors_the_position_of_the_one_that_counts_is_moved(tmp_path: Path) -> None:
+    """Table and tool are read through filters that differ; the table's error counts."""
+    options = "[controller.channel.1]\nS_max = 2.0\n"
+    (tmp_path / "plant.py").write_text(PLANT.replace("[[1, 0]],", "[[1, 0], [0, 1]],"))
+    text = CASE.replace("OPTIONS", "").replace("LOOP", SAMPLED)
+    text = text.replace('"sections"', f'"sections"\nbandwidth_of = "1"\n{options}')
+    text = text.replace("lag_hz = 5000.0", "lag_hz = [5000.0, 700.0]")
+    (tmp_path / "case.toml").write_text(text)
+    problem, one = problem_of(load_case(tmp_path / "case.toml")), controller()
+    K = replace(one, B=one.B @ np.array([[1.0, 0.2]]), D=np.zeros((1, 2)))
+    (loop,) = design_loops(problem, problem.start, K)[:1]
+    A, Bu, Bd, C = (np.pad(part, pad) for part, pad in zip(
+        machine(), ([(0, 1), (0, 1)], [(0, 1), (0, 0)], [(0, 1), (0, 0)], [(0, 1), (0, 1)]),
+        strict=True))  # fmt: skip
+    s = HZ * 700.0
+    A[7, 1], A[7, 7], C[4, 7] = s, -s, 1.0
+    whole = expm(np.block([[A, Bu], [np.zeros((1, 9))]]) / RATE)
+    omega = np.geomspace(1.0, 0.99 * np.pi * RATE, 400)
+    loop = replace(loop, sampling=Sampling(RATE))  # no delay
+    z = np.exp(1j * omega / RATE)[:, None, None]
+    u = C @ np.linalg.solve(z * np.eye(8) - whole[:8, :8], whole[:8, 8:] + 0j)
+    d = C @ np.linalg.solve(1j * omega[:, None, None] * np.eye(8) - A, Bd[:, :1] + 0j)
+    k = tustin(K, 1.0 / RATE).at(z[:, 0, 0])
+    sensors = [0, 4]
+    sent = np.linalg.solve(np.eye(1) + k @ u[:, sensors], k @ d[:, sensors])
+    own = (d[:, [1]] - u[:, [1]] @ sent)[:, 0, 0]
+    np.testing.assert_allclose(loop.moved(omega)[:, 0, 0], own, rtol=0, atol=1e-6 * abs(own).max())
+    assert loop.ports.wanted == pytest.approx(np.ones((1, 1)), abs=1e-8)
+    late = DELAY + 0.5 / RATE + 1.4 / (HZ * 2000.0) + 1.0 / (HZ * 5000.0)  # of the table's filter
+    forward = motion_of(problem, problem.start).forward
+    assert forward[2:4, 0] == pytest.approx([M0 + M1, (M0 + M1) * late], rel=1e-6)

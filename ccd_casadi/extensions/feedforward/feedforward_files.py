@@ -20,7 +20,7 @@ from ccd_casadi.extensions.feedforward.move_responses import (
     responses_of,
 )
 from ccd_casadi.extensions.feedforward.set_feedforward import SetFeedforward
-from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import run_name
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -206,10 +206,10 @@ def improved(
     profile = Setpoint(durations, snaps, np.nan, np.nan, np.nan)  # the largest are not needed
     if not before["contraction"] < 1.0:
         raise UserError(f"{path}: learning does not converge on every plant of its set")
-    if run.loop.at or plant_of(run.problem).ports:
+    if run.loop.at or run.loop.names != Loop.names:
         words = "learning is for loops whose error counts at their sensors, one for each actuator"
         raise UserError(f"{path}: {words}")
-    own = run.loop_on(run.plant.plant_si())  # whose error the log has
+    own = replace(run.loop, drive=None, counted=None)  # the log has the error that K reads
     model = responses_of(own, profile, shape.orders, axis=before["axis"] - 1,
                          samples=before["samples"])  # fmt: skip
     count, q = model.reached.shape[:2]
