@@ -176,12 +176,13 @@ def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace)
     of_ports = plant_of(problem).ports
     if found.at and len(counted) and "performance" not in of_ports:
         counted = np.array([found.at[0].output]) @ counted  # positions that no sensor filters
-    names = (("performance", "output"), ("disturbance", "actuator"))
+    names = ("performance" if "performance" in of_ports else Loop.names[0],
+             "disturbance" if "disturbance" in of_ports else Loop.names[1])  # fmt: skip
     return replace(
         found, plant=strictly_proper(plant.A, plant.B[:, :m], own), force=force,
         drive=plant.B[:, m:] if plant.B.shape[1] > m else None,
         counted=counted if len(counted) else None,
-        names=tuple(port if port in of_ports else other for port, other in names),
+        names=names,
     )  # fmt: skip
 
 
