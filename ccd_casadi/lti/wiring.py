@@ -141,7 +141,8 @@ class Wiring:
         """What a reader of figures must know."""
         both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
         there = [f"{name} {own.words}" for name, own in both if own]
-        return f"{' and '.join(there)} in every loop, not in compliance"
+        words = "disturbing forces act on the machine, its unfiltered position counts"
+        return f"{' and '.join(there)} in every loop; {words}"
 
     def poles(self, outputs: int, inputs: int) -> np.ndarray | None:
         """The poles λ in rad/s of 1/Π(1 - s/λ) where the wiring is that of every channel alike."""
