@@ -212,10 +212,10 @@ def largest_force_step(
         decay = max(decay, float(times[last]) if last + 1 < len(times) else np.inf)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
-        moved = f"{'output' if loop.counted is None else 'performance'} {output + 1}"
-        if loop.at and loop.counted is None:
+        moved = f"{loop.names[0]} {output + 1}"
+        if loop.at and loop.names[0] == Loop.names[0]:
             moved = f"channel {loop.at[0].name}"  # whose error counts
-        names = moved, f"{'actuator' if loop.drive is None else 'disturbance'} {actuator + 1}"
+        names = moved, f"{loop.names[1]} {actuator + 1}"
         found.append(ForceStep(0.0, size, float(times[k]), output, actuator, plant, names))
     return replace(max(found, key=lambda step: step.size), decay=decay)
 
@@ -381,6 +381,8 @@ def loop_entry(
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
         "force_step_max": force.size,
-        "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1) and not loops[0].ported),
+        "force_step_at": force.entry(
+            loops[0].plant.D.shape == (1, 1) and loops[0].names == Loop.names
+        ),
         "loop_warnings": warnings,
     }

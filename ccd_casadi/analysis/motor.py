@@ -329,7 +329,8 @@ class DrivenMechanics:
         found, row = self(theta), np.array([self.motion.output])
         if self.motion.output:
             own = (*found.derivatives[:4], row @ found.derivatives[4])
-            found = replace(found, C=row @ found.C, derivatives=own)
+            found = replace(found, C=row @ found.C, derivatives=own,
+                            wiring=found.wiring.of_output(row[0]))  # fmt: skip
         free = without_hidden_rigid_modes(modal_plant(found, FREE))
         bare = scale_plant(free, 1.0, bare=True)
         return motion_at(self.motion, bare, self.mass(theta), self.place, sampling)

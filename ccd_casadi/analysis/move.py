@@ -54,7 +54,7 @@ class Move:
     error : (k,) or (k, p) array
         Of the moving output, or of all.
     force : (k, m) array
-        N.
+        That the machine gets, N.
     feedforward : bool
         Whether there is any.
     duration, window : float
@@ -63,6 +63,8 @@ class Move:
         Share of the instants at a limit.
     rest : float
         Error of the moving output that stays for ever; NaN where it is not known.
+    command : (k, m) array or None
+        u, N, of which actuators make the force; None: they are one.
     """
 
     time: Array
@@ -74,6 +76,7 @@ class Move:
     window: float
     saturated: float = 0.0
     rest: float = np.nan
+    command: Array | None = None
 
     @property
     def settled(self) -> float:
@@ -125,6 +128,12 @@ class Move:
         return np.asarray(np.abs(self.force).max(axis=0))
 
     @property
+    def peak_command(self) -> Array:
+        """Of each u (m,), N."""
+        given = self.force if self.command is None else self.command
+        return np.asarray(np.abs(given).max(axis=0))
+
+    @property
     def rms_force(self) -> Array:
         """Of each force over the move (m,)."""
         return self._rms(self.force)
@@ -137,8 +146,8 @@ class Move:
     def until(self, seconds: float) -> "Move":
         """Its first part."""
         kept = self.time <= seconds
-        cut = {name: getattr(self, name)[kept]
-               for name in ("time", "position", "error", "force")}  # fmt: skip
+        names = ("time", "position", "error", "force", "command")
+        cut = {name: part[kept] for name in names if (part := getattr(self, name)) is not None}
         return replace(self, **cut)
 
     @property
@@ -271,10 +280,12 @@ def simulate(
         if turn + 1 >= options.doublings and not (stable and rest <= 0.5 * window):
             break
         tail *= 2.0
-    force = x @ closed.C_u.T + np.outer(r[0], closed.D_u @ reference) + r.T @ ahead
+    u = x @ closed.C_u.T + np.outer(r[0], closed.D_u @ reference) + r.T @ ahead
+    force = u if loop.force is None else x[:, : loop.force.shape[1]] @ loop.force.T
     error = error[:, 0] if len(wanted) == 1 else error
-    return Move(time, r[0], error, force, forces is not None,
-                profile.duration, window, rest=float(np.abs(r[0, -1] * left).max()))  # fmt: skip
+    return Move(time, r[0], error, force, forces is not None, profile.duration, window,
+                rest=float(np.abs(r[0, -1] * left).max()),
+                command=None if loop.force is None else u)  # fmt: skip
 
 
 def counted_rows(loop: Loop, axis: int, closed: ClosedLoop) -> tuple[Array, Array, Array]:

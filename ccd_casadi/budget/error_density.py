@@ -142,8 +142,8 @@ class PanelOptions:
 
 @dataclass(frozen=True)
 class Responses:
-    """G and K as in the loop, S = (1 + GK)⁻¹, S G of the disturbed G, and of what counts but no
-    sensor sees the parts of u and of d, (k, ·, ·)."""
+    """G and K as in the loop, S = (1 + GK)⁻¹, S G of the disturbed G, of what counts but no sensor
+    sees the parts of u and of d, and the force that actuators make of u, (k, ·, ·)."""
 
     G: np.ndarray
     K: np.ndarray
@@ -152,6 +152,7 @@ class Responses:
     moved: np.ndarray
     ports: Ports
     beyond: tuple[np.ndarray, np.ndarray] | None = None
+    given: np.ndarray | None = None
 
     def seen(self, kind: SourceKind) -> np.ndarray:
         """What of a source the controller reads."""
@@ -160,7 +161,7 @@ class Responses:
         return self.S @ self.ports.reference if kind is SourceKind.SETPOINT else -self.S
 
     def of(self, kind: SourceKind) -> tuple[np.ndarray, np.ndarray]:
-        """H_e and H_u of a source."""
+        """H_e, and H_u of the force that the machine gets, of a source."""
         seen = self.seen(kind)
         force = self.K @ seen
         true = np.eye(seen.shape[1]) + seen if kind is SourceKind.SENSOR_NOISE else seen
@@ -168,7 +169,7 @@ class Responses:
         if self.beyond is not None:
             of_u, of_d = self.beyond
             true = true - of_u @ force - (of_d if kind in FORCES else 0.0)
-        return true, force
+        return true, force if self.given is None else self.given @ force
 
 
 def responses(loop: Loop, hz: Array) -> Responses:
@@ -198,11 +199,17 @@ def responses(loop: Loop, hz: Array) -> Responses:
         S = np.eye(G.shape[1]) - G @ inner @ K
         moved = G @ inner if free is G else free - G @ inner @ K @ free
     found = Responses(G, K, free, S, moved, ports)
+
+    def of_u(rows: Array) -> np.ndarray:
+        reading = strictly_proper(plant.A, plant.B, rows)
+        return replace(loop, plant=reading).run_responses(omega)[0]
+
+    if ports.force is not None:
+        found = replace(found, given=of_u(ports.force))
     if ports.beyond is None:
         return found
-    of_u, of_d = (strictly_proper(plant.A, B, ports.beyond) for B in (loop.plant.B, ports.drive))
-    run = replace(loop, plant=of_u).run_responses(omega)[0]
-    return replace(found, beyond=(run, of_d.swept(omega)))
+    of_d = strictly_proper(plant.A, ports.drive, ports.beyond)
+    return replace(found, beyond=(of_u(ports.beyond), of_d.swept(omega)))
 
 
 def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:

@@ -224,7 +224,11 @@ def process(loop: Loop, source: ErrorSource) -> Process:
     if K.period:
         K, T = replace(K, A=K.A - np.eye(len(K.A))), None
     M = run_matrix((K.A, K.B, K.C, K.D), T)
-    return disturbed(loop.plant, (source,), loop.sampling, len(K.A), loop.ports).closed(M)
+    found = disturbed(loop.plant, (source,), loop.sampling, len(K.A), loop.ports).closed(M)
+    if (force := loop.ports.force) is None:
+        return found
+    given = np.pad(force, [(0, 0), (0, len(found.A) - force.shape[1])])
+    return replace(found, F=given, V=0.0 * found.V)
 
 
 def _held(G: StateSpace, hold: Sampling) -> StateSpace:

@@ -5,8 +5,10 @@
     sensor noise  n in m, on what the controller reads        e = T n,      u = -KS n
     setpoint      r in m                                      e = S r,      u = KS r
 
-e = r - y is the error of the true position, not of the measured one. With several channels each
-has a source of its own, independent of the others, of the same spectrum.
+e = r - y is the error of the true position, not of the measured one. Behind an actuator a(s) and
+before a sensor c(s), with G = c g a, d acts on the mechanics g, n enters behind c, r is compared
+with what c gives, e = r - z counts z = g (a u + d), and the force is a u. With several channels
+each has a source of its own, independent of the others, of the same spectrum.
 """
 
 from collections.abc import Iterable

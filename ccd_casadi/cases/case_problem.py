@@ -193,9 +193,8 @@ def _require_ports_known(problem: CoDesignProblem) -> None:
         refuse_ports(problem, "inner.compliance_max, which bounds the actuators' at the sensors")
     elif sections.figure is not BANDWIDTH:
         refuse_ports(problem, f'inner.minimise = "{sections.minimise}"')
-    for given, name in ((source.wiring, "[actuator] and [sensor]"), (source.places, "[places]")):
-        if given:
-            refuse_ports(problem, name)
+    if source.places:
+        refuse_ports(problem, "[places]")
 
 
 def _suspension(case: Case) -> Suspension:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, corners_hz, damping_ratios, key, one_or_more
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.lti.wiring import Filters
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail
 
 def check_filters(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where [actuator] or [sensor] is not known together with another table."""
-    inner, budget = tables["inner"], tables["budget"]
+    inner, structure = tables["inner"], tables["controller"].structure
     given = [name for name in ("actuator", "sensor") if filters_of(tables[name])]
     for name in ("actuator", "sensor"):
         table = tables[name]
@@ -99,15 +100,18 @@ def check_filters(tables: Mapping[str, Any], fail: Fail) -> None:
             raise fail(f"{name}.damping", "has no effect without second_order_hz; give that")
     if not given:
         return
-    alone = "of the mechanics, which an actuator and a sensor are not part of; drop one of the two"
-    sources = any(getattr(budget, item.name) for item in fields(budget) if item.name != "window_ms")
-    others = (("move", tables["move"] != MoveTable()), ("budget", sources),
-              ("inner.compliance_max", inner.compliance_max is not None))  # fmt: skip
-    for key_of, there in others:
-        if there:
-            raise fail(
-                key_of, f"is beside [{given[0]}]: forces and moves are judged as those {alone}"
-            )
+    if inner.minimise != BANDWIDTH.key:
+        words = f'is "{inner.minimise}" beside [{given[0]}], whose plants have the bandwidth alone'
+        raise fail("inner.minimise", f"{words}; drop one of the two: runs report the other figures")
+    if inner.compliance_max is None:
+        return
+    if structure != "sections":
+        words = f"is beside [{given[0]}], of a force on the machine, which full order does not know"
+        raise fail("inner.compliance_max", f'{words}; give controller.structure = "sections"')
+    for key_of, values in vars(filters_of(tables["sensor"])).items():
+        if len(set(values)) > 1:
+            words = "differs between sensors, beside inner.compliance_max of a position"
+            raise fail(f"sensor.{key_of}", f"{words}; give one for all, or drop that bound")
 
 
 def filters_of(table: "FiltersTable") -> Filters:

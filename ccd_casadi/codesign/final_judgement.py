@@ -128,7 +128,8 @@ def second_on_set(
     if judged is None or K is None:
         return NOT_COMPARED
     pairs = zip(plants_of_set(problem, theta), judged.plants, strict=True)
-    of_GS, bounds = ("GS",) if problem.sampling is None else (), kind_of(problem).bounds()
+    alike = problem.sampling is None and not problem.source.wiring  # its GS and the second's
+    of_GS, bounds = ("GS",) if alike else (), kind_of(problem).bounds()
     return compared(
         (second_opinion(plant, K, problem.sampling, places=bounds.places),
          {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)}

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget
-from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget, member_loops
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.statics import compliance_words, statics
+from ccd_casadi.synthesis.statics import compliance_words, statics_of
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
 if TYPE_CHECKING:
@@ -66,21 +65,17 @@ def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> d
 def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design) -> dict[str, Any]:
     """A mixed-sensitivity design's figures, with compliance, margins and steps of a stable loop:
     these on the plant and those of its robust set."""
-    figures, plant = design.figures, scaled_plant(problem, theta)
+    figures = design.figures
     found = figures_dict(figures)
     if not figures.certified:
         return found
-    plants = [one.plant_si() for one in plant.members]
-    rest = statics(plants[0], design.controller, bandwidth=figures.bandwidth,
-                   omega_low=problem.inner.omega_low)  # fmt: skip
+    loops, low = member_loops(problem, theta, design.controller), problem.inner.omega_low
+    rest = statics_of(loops[0], bandwidth=figures.bandwidth, omega_low=low)
+    most = max(one.compliance for one in loops) if loops[0].ported else figures.compliance
     return (
         found
-        | loop_entry(
-            [Loop(one, design.controller) for one in plants],
-            figures.bandwidth,
-            figures.sensitivity_peak,
-        )
-        | compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
+        | loop_entry(loops, figures.bandwidth, figures.sensitivity_peak)
+        | compliance_dict(most, rest.compliance, rest.low, rest.low_hz)
     )
 
 
@@ -115,9 +110,12 @@ def move_entry(
     cycle, own = motion.cycle, problem.source.motion
     times = np.maximum([move.settled for move in made], cycle.profile.duration)
     ahead = motion.forward_force(problem.sampling)
-    needed = max(float(cycle.peak_force), ahead, *(float(one.peak_force.max()) for one in made))
+    most, given = (max(float(getattr(one, of).max()) for one in made)
+                   for of in ("peak_force", "peak_command"))  # fmt: skip
+    commanded = {} if made[0].command is None else {"needed_command": max(ahead, given)}
+    needed = max(float(cycle.peak_force), most, 0.0 if commanded else ahead)
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
-    k, _, most = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
+    k, _, limit = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
@@ -132,9 +130,10 @@ def move_entry(
         **({} if own.motor is None else {
             "peak_current": cycle.peak_force / k,
             "needed_current": needed / k,
-            "needed_share": needed / (k * most)}),
+            "needed_share": needed / (k * limit)}),
         "feedforward_force": ahead,
         "needed_force": needed,
+        **commanded,  # before the actuators
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip
 

@@ -10,7 +10,7 @@ import scipy
 
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, design_loops, kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, with_ports
 from ccd_casadi.lti.loop import Loop, Sampling, tustin
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace
@@ -259,7 +259,7 @@ def loops_of(
     system = mechanics(plant_of(problem), theta)
     places = kind_of(problem).bounds().places
     found = loops_off_model(system, controller, problem.sampling, problem.suspension.free, places)
-    if not plant_of(problem).ports:
+    if with_ports(problem) is problem:
         return found
     return replace(found, ported=design_loops(problem, theta, controller)[0])
 

@@ -105,7 +105,7 @@ def move(
 ) -> Move:
     """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None. Of several
     sensors on one actuator that of the first place, with references as of `course`. The error is
-    that of the `ports`, where they count something else."""
+    that of the `ports`, where they count something else, the force what their actuators give."""
     hardware = hardware or Electronics()
     T, n, m = realisation.system.period, len(plant.A), len(realisation.system.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
@@ -130,26 +130,32 @@ def move(
     rows, aim = (output[None] @ plant.C, np.ones(1)) if places else (plant.C, reference)
     if ports is not None:
         rows, aim = ports.counted, ports.wanted[:, 0 if places else axis]
-    error, force = np.zeros((count, len(aim))), np.zeros((count, m))
+    error, command = np.zeros((count, len(aim))), np.zeros((count, m))
+    if (actuators := None if ports is None else ports.force) is not None:
+        force = np.zeros_like(command)
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
         r = reference * wanted[0, k]
         error[k] = aim * wanted[0, k] - rows @ x
+        if actuators is not None:
+            force[k] = actuators @ x
         u, limited = controller(r - _stepped(y, hardware.sensor_step), ahead[k])
         clipped += limited
-        force[k] = _stepped(u, hardware.force_step)
+        command[k] = _stepped(u, hardware.force_step)
         now, end = float(k), k + 1.0
         while now < end:  # from one arrival to the next
             while arriving <= k and reaches[arriving] <= now + DelayOptions.instant:
-                u_now = force[arriving]
+                u_now = command[arriving]
                 arriving += 1
             following = min(end, reaches[arriving]) if arriving <= k else end
             step = over(round(following - now, 9))
             x = step[:, :n] @ x + step[:, n:] @ u_now
             now = following
-    return Move(time, wanted[0], error, force, forward is not None, profile.duration,
-                window, saturated=clipped / count)  # fmt: skip
+    only = actuators is None  # then the command is the force
+    return Move(time, wanted[0], error, command if only else force, forward is not None,
+                profile.duration, window, saturated=clipped / count,
+                command=None if only else command)  # fmt: skip
 
 
 def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, bool]]:
@@ -341,7 +347,7 @@ def on_hardware(
         ways[BACK] = made(realisation, forward=forward)
     if hardware is not None and not hardware.ideal:
         ways[MACHINE] = made(realisation, forward=forward, hardware=hardware)
-    peak, least = float(unlimited.peak_force.max()), np.nan
+    peak, least = float(unlimited.peak_command.max()), np.nan
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
         least = 1.0
@@ -370,6 +376,7 @@ def hardware_dict(found: OnHardware) -> dict[str, Any]:
                 "peak_error": move.peak_error,
                 "last_error": move.last_error(watched),
                 "peak_force": float(move.peak_force.max()),
+                "peak_command": float(move.peak_command.max()),
                 "saturated": move.saturated,
             }
             for words, move in found.ways.items()

@@ -5,7 +5,7 @@ x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{
 infinite at 0 Hz: at rest it is enclosed times y².
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 from math import factorial
@@ -99,21 +99,16 @@ class FrequencyAxis:
 
     @cached_property
     def passed(self) -> Affine:
-        """W at s = y/x, or at s."""
-        return self._passed(self.x, self.y) if self.period is None else self.passed_unheld
+        """W at s = y/x, of no hold."""
+        found = self.x * 0.0 + 1.0
+        for pole in self.low_pass:
+            found = found * self.x * inverse(self.x - self.y * (1.0 / pole))
+        return found
 
     @cached_property
-    def passed_unheld(self) -> Affine:
-        """W at s, that of no hold."""
-        if self.period is None:
-            return self.passed
-        return self._passed(self.s * 0.0 + 1.0, self.s)
-
-    def _passed(self, x: Affine, y: Affine) -> Affine:
-        found = x * 0.0 + 1.0
-        for pole in self.low_pass:
-            found = found * x * inverse(x - y * (1.0 / pole))
-        return found
+    def plain(self) -> "FrequencyAxis":
+        """Without W, as a force on the mechanics has it."""
+        return replace(self, low_pass=())
 
     @cached_property
     def held_low_pass(self) -> tuple[Affine, ...]:
@@ -201,10 +196,11 @@ class FrequencyAxis:
         return parts[0], parts[1]
 
     def driven_away_unheld(self, square: Affine) -> Affine:
-        """The same without hold and delay."""
-        n = len(square.slope)
-        s = self.s.of(n)
-        return inverse(s * s - square) * self.passed_unheld.of(n)
+        """The same without hold and delay, and without W."""
+        if self.period is None:
+            return self.plain.driven_away(square)
+        s = self.s.of(len(square.slope))
+        return inverse(s * s - square)
 
     @property
     def free_body(self) -> Affine:
@@ -236,9 +232,9 @@ class FrequencyAxis:
 
     @property
     def free_body_unheld(self) -> Affine:
-        """The same without hold and delay: sampled y²/s² = sinc²(ωT/2), |sinc''| <= 1/3."""
+        """The same without hold, delay and W: sampled y²/s² = sinc²(ωT/2), |sinc''| <= 1/3."""
         if self.period is None:
-            return self._per_y_squared(self.x * self.x * self.passed)
+            return self.plain.free_body
         half = self.s.centre.imag * 0.5 * self.period
         slope, width = self.s.slope.imag * 0.5 * self.period, np.abs(self.s.slope).sum(0)
         small = np.abs(half) < 1e-3  # there the series holds to rounding
@@ -247,7 +243,7 @@ class FrequencyAxis:
         steep = np.where(small, -half / 3.0, (np.cos(over) - np.sin(over) / over) / over)
         rest = (0.5 * self.period * width) ** 2 / 6.0 + 1e-12
         sinc = Affine(value, steep * slope, rest)
-        return self._per_y_squared(sinc * sinc * self.passed_unheld)
+        return self._per_y_squared(sinc * sinc)
 
     def _per_y_squared(self, form: Affine) -> Affine:
         """The form itself at rest, else over y²."""

@@ -9,6 +9,7 @@ every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_r
 loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
 `lti.between_samples`). Its GS and weighted KS and T are products of functions of z and of s, which
 no Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
+GS of a wired plant is S times its mechanics, of a force on these, and known there too.
 """
 
 from collections.abc import Sequence
@@ -46,6 +47,7 @@ from ccd_casadi.fixed_structure.certificate_responses import (
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, weighted
+from ccd_casadi.lti.wiring import WiredPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import HZ, counted
@@ -182,6 +184,7 @@ def certify(
         Stability, figures over bounds, and ω_b in rad/s, the least of all plants.
     """
     systems = [own if isinstance(own, StateSpace) else own.plant_si() for own in plants]
+    bare = any(isinstance(G, WiredPlant) for G in systems)
     sizes = [(G.A.shape, G.B.shape, G.C.shape) for G in systems]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
     batch = options.batch
@@ -221,7 +224,7 @@ def certify(
     else:
         words = f"stable and within every bound on {counted(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
-    products = ("KS", "T", "GS") if sampling is not None else ()
+    products = ("KS", "T", "GS") if sampling is not None else ("GS",) if bare else ()
     untested = tuple(name for name in worst if kind_and_channel(name)[0] in products)
     return SetCertificate(passed, bandwidth, tuple(found), worst, words, untested)
 
@@ -235,11 +238,12 @@ def judged(
     options: JudgeOptions = JudgeOptions(),
 ) -> list[PlantFigures]:
     """The figures of every plant's loop; the plants have matrices of one size."""
-    free = [balanced_system(plant) for plant in plants]
+    own = [balanced_system(plant) for plant in plants]
     K = balanced_system(controller)
-    G, held = free, K
+    G, held = own, K
     if sampling is not None:
-        G, held = [sampled(one, sampling) for one in free], as_run(K, sampling)
+        G, held = [sampled(one, sampling) for one in own], as_run(K, sampling)
+    free = [balanced_system(getattr(plant, "mechanics", plant)) for plant in plants]
     if plants[0].period:  # what acts on it between its instants is not known
         free = G
     loops = [error_response(one, held) for one in G]
@@ -256,12 +260,12 @@ def judged(
     if bounds.weights is not None:
         w = bounds.weights
         corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
-    own, grids = np.linalg.eigvals(held.A), []
+    of_K, grids = np.linalg.eigvals(held.A), []
     zeros = [] if K.D.any() or K.period else [K.zeros(_size(K))]
     for i in good:
-        nulls = free[i].rates_of(free[i].zeros(_size(free[i])))
-        roots = [poles[i], np.linalg.eigvals(G[i].A), own, nulls, *zeros]
-        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner,
+        nulls = own[i].rates_of(own[i].zeros(_size(own[i])))
+        roots = [poles[i], np.linalg.eigvals(G[i].A), of_K, nulls, *zeros]
+        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(own[i]), corner,
                                   options.curves))  # fmt: skip
     grid, rows = padded(grids), np.arange(len(good))
     table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
@@ -283,7 +287,7 @@ def judged(
     loops = [loops[i] for i in good]
     inputs = [_at_the_actuator(loop, G[i], held) for loop, i in zip(loops, good, strict=True)]
     for k, i in enumerate(good):
-        _raised(tops, k, loops[k], G[i], held, bounds, table.period)
+        _raised(tops, k, loops[k], G[i], held, bounds, table)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
     whole = loops
     if bounds.error is not None:
@@ -340,10 +344,11 @@ def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Arra
 
 def _raised(
     tops: dict[str, tuple[Array, Array]], row: int, loop: StateSpace, G: StateSpace,
-    K: StateSpace, bounds: Bounds, period: float | None,
+    K: StateSpace, bounds: Bounds, table: LoopResponses,
 ) -> None:  # fmt: skip
     """Raise the largest KS, T and GS of plant `row`, weighted or not, to what a Hamiltonian finds
-    above them; `loop` is its S. Of a sampled loop KS and T alone."""
+    above them; `loop` is its S. Of a sampled loop KS and T alone; no GS of a wired plant."""
+    period = table.period
     zero, p = np.zeros((len(G.C), len(K.A))), len(G.C)
     of_u, of_y = np.hstack([-K.D @ G.C, K.C]), np.hstack([G.C, zero])
     KS = StateSpace(loop.A, loop.B, of_u, K.D)
@@ -355,7 +360,8 @@ def _raised(
     systems = {"KS": KS, "T": T}
     if period is None:
         d = np.vstack([G.B, np.zeros((len(K.A), G.B.shape[1]))])
-        systems["GS"] = StateSpace(loop.A, d, of_y, np.zeros((p, d.shape[1])))
+        if table.free is None:
+            systems["GS"] = StateSpace(loop.A, d, of_y, np.zeros((p, d.shape[1])))
         if bounds.weights is not None:
             _, of_KS, of_T = bounds.weights.filters()
             systems["weighted KS"] = weighted(KS, np.tile(of_KS, (len(K.C), 1)))

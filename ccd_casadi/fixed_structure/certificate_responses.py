@@ -16,6 +16,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ChannelBounds
 from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
+from ccd_casadi.lti.wiring import WiredPlant
 from ccd_casadi.support.arrays import Array
 
 if TYPE_CHECKING:
@@ -119,8 +120,8 @@ class Triangular:
 
 
 class LoopResponses:
-    """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
-    K of the controller, which may have an `integrator`.
+    """The loops of a set of plants: `free` as a disturbing force moves them, `G` as the loop has
+    them, with hold and delay; K of the controller, which may have an `integrator`.
 
     At a pole of G on the axis S, KS, T and GS have limits, which are taken a little beside it.
     """
@@ -135,8 +136,8 @@ class LoopResponses:
         integrator: bool = True,
     ) -> None:
         self.G, self.K = Triangular(G), Triangular([K])
-        bare = sampling is None or free[0].period
-        self.free = None if bare else Triangular(free)
+        alike = free[0].period or (sampling is None and not isinstance(G[0], WiredPlant))
+        self.free = None if alike else Triangular(free)
         self.period = None if sampling is None else sampling.period
         self.bounds, self.integrator = bounds, integrator
         self.plants = free

@@ -212,9 +212,9 @@ def sensors_on_one_actuator(
 
 def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
     """Uᵀ G V, the same states."""
-    U, V = decoupling.outputs, decoupling.inputs
-    return replace(plant, B=plant.B @ V, C=U.T @ plant.C, dB=plant.dB @ V,
-                   dC=U.T @ plant.dC, channels=())  # fmt: skip
+    U, V, own = decoupling.outputs, decoupling.inputs, plant.mechanics
+    return replace(plant, B=plant.B @ V, C=U.T @ plant.C, dB=plant.dB @ V, dC=U.T @ plant.dC,
+                   channels=(), mechanics=own and in_channels(own, decoupling))  # fmt: skip
 
 
 def sensor_levels(plant: ScaledPlant, decoupling: Decoupling) -> Array:
@@ -257,9 +257,11 @@ def channel_plant(
     live = (drive > absent * drive.max()) | (reading > absent * reading.max())
     at = np.flatnonzero(live[group])
     dA, dB, dC = whole.dA, whole.dB[:, :, [number]], whole.dC[:, [number]]
+    own = plant.mechanics
     return replace(
         whole, A=whole.A[np.ix_(at, at)], B=b[at], C=c[:, at], dA=dA[:, at][:, :, at], dB=dB[:, at],
         dC=dC[:, :, at], grid=np.empty(0), gain=np.empty(0),
+        mechanics=own and channel_plant(own, decoupling, number, absent=absent),
     )  # fmt: skip
 
 
@@ -315,11 +317,12 @@ def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:
     ScaledPlant
         The same plant, with the ω₀ and the force of `first`.
     """
-    time = plant.omega_0 / first.omega_0
+    time, own = plant.omega_0 / first.omega_0, plant.mechanics
     drive = time * first.force / plant.force
     return replace(
         plant, A=time * plant.A, B=drive * plant.B, dA=time * plant.dA, dB=drive * plant.dB,
         omega_0=first.omega_0, force=first.force, channels=(), family=(),
+        mechanics=own and in_units_of(own, first),
     )  # fmt: skip
 
 

@@ -27,9 +27,9 @@ def discs_of(
     plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: FrequencyAxis,
     free: bool,
 ) -> tuple[Discs, Discs, np.ndarray]:  # fmt: skip
-    """Of all modes as the loop has them, and where `free` without hold and delay; where all
-    flexible modes stay damped (N,)."""
-    free &= axis.period is not None
+    """Of all modes as the loop has them, and where `free` as a force on the mechanics has them,
+    without hold, delay and low passes; where all flexible modes stay damped (N,)."""
+    free &= axis.period is not None or bool(axis.low_pass)
     count = (len(plant.omega), 1 + len(names), low.shape[1])
     held, bare = (
         Discs(np.zeros(count[::2], complex), np.zeros(count[::2]), np.zeros(count))
@@ -67,8 +67,9 @@ def discs_of(
         factors, beside = [axis.factor(*pole) for pole in poles], axis.lagged_of(poles)
         _fill(held, i, rows, factors, least, strength, beside)
         if free:
-            s, W = axis.s.of(len(rows)), axis.passed_unheld.of(len(rows))
-            _fill(bare, i, rows, [(s - p, residue * W) for p, residue in poles], decay, strength)
+            plain = [(axis.s.of(len(rows)) - p, N) for p, N in poles]
+            plain = [axis.plain.factor(*pole) for pole in poles] if T is None else plain
+            _fill(bare, i, rows, plain, least if T is None else decay, strength)
     if q:  # where modes are not enclosed their parameters are divided before anything else
         held.shares[:, -q:] = np.where(known, held.shares[:, -q:], 1e30 * (high - low)[-q:])
     return held, bare if free else held, damped

@@ -292,6 +292,7 @@ def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Ar
     out = form_slopes(slopes, which, v, x, y, False)
     free = constraints.curve == LoopCurve.GS
     if free.any():
+        slopes = problem.plants.forced.slopes
         out[free] += form_slopes(slopes, which[free], v[free], -x[free], right[free], True)
     return np.asarray(out)
 

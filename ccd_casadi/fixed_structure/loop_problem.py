@@ -89,10 +89,10 @@ class LoopProblem:
 
     @cached_property
     def answers(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the plants answer at `fixed`, with hold and delay and without, (P, k, p, m)."""
+        """What the plants answer at `fixed`, to u and to a disturbing force, (P, k, p, m)."""
         P, v = self.plants, self.fixed
         which = np.repeat(np.arange(P.count), v.shape[1])
-        free = P.modes._replace(period=0.0, delay=0.0)
+        free = P.forced.modes._replace(period=0.0, delay=0.0)
         pairs = ((P.modes, v), (free, P.frequency(v)))
         shape = (*v.shape, *P.residues.shape[2:])
         held, bare = (responses(modes, which, at.ravel())[:, 0] for modes, at in pairs)
@@ -267,7 +267,7 @@ class LoopProblem:
         plants = self.plants
         factors, channel = self._factors
         return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,
-                          limits, self._rows, self._kinds)  # fmt: skip
+                          limits, self._rows, self._kinds, plants.forced.modes[:2])  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,8 @@ class PlantSet:
         part is that of 1/s².
     out, into : array (c, p), (m, c)
         Uᵀ and V in the coordinates of the plants: identities where they are turned.
+    mechanics : PlantSet, optional
+        The same without actuators and sensors, where it has these.
     """
 
     plants: tuple[LoopPlant, ...]
@@ -127,6 +129,12 @@ class PlantSet:
     residues: np.ndarray
     out: Array
     into: Array
+    mechanics: "PlantSet | None" = None
+
+    @property
+    def forced(self) -> "PlantSet":
+        """What a disturbing force moves, at the position that counts."""
+        return self if self.mechanics is None else self.mechanics
 
     @property
     def count(self) -> int:
@@ -260,6 +268,8 @@ def plant_set(
     not those of the channels, that has more outputs than inputs, or is not diagonalisable.
     """
     out = into = np.eye(1)
+    bare = [in_units_of(plant.mechanics, plants[0]) for plant in plants if plant.mechanics]
+    mechanics = plant_set(bare, sampling, decoupling, alike) if bare else None
     if decoupling is not None:
         out, into = decoupling.outputs.T, decoupling.inputs
     for number, plant in enumerate(plants, 1):
@@ -291,7 +301,7 @@ def plant_set(
         if len(one.chains):
             own[one.chains[0, 0]] += 1j * one.free_bodies
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
-    return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into)
+    return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into, mechanics)
 
 
 def padded(parts: Sequence[np.ndarray], fill: float = 0.0, dtype: type = float) -> np.ndarray:

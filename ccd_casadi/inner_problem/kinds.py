@@ -9,7 +9,13 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.inner_kind import InnerKind
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner, with_ports
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    scaled_plant,
+    true_inner,
+    with_ports,
+)
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
@@ -164,10 +170,19 @@ def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace)
     p, m = controller.B.shape[1], len(controller.C)
     if plant.D.shape == (p, m):
         return found
+    own, counted, force = plant.C[:p], plant.C[p:], None
+    if problem.source.wiring.actuator:
+        counted, force = counted[:-m], counted[-m:]
+    of_ports = plant_of(problem).ports
+    if found.at and len(counted) and "performance" not in of_ports:
+        counted = np.array([found.at[0].output]) @ counted  # positions that no sensor filters
+    names = ("performance" if "performance" in of_ports else Loop.names[0],
+             "disturbance" if "disturbance" in of_ports else Loop.names[1])  # fmt: skip
     return replace(
-        found, plant=strictly_proper(plant.A, plant.B[:, :m], plant.C[:p]),
+        found, plant=strictly_proper(plant.A, plant.B[:, :m], own), force=force,
         drive=plant.B[:, m:] if plant.B.shape[1] > m else None,
-        counted=plant.C[p:] if len(plant.C) > p else None,
+        counted=counted if len(counted) else None,
+        names=names,
     )  # fmt: skip
 
 

@@ -184,7 +184,8 @@ class PlantSource:
     given : GivenFunction or None
         A function of a program, whose `content` the program states.
     wide : bool
-        With its disturbance as further inputs, and its performance as further outputs.
+        With its disturbance as further inputs, and its performance as further outputs; of a wired
+        plant with those of the mechanics where it has none, and with the actuators' forces.
     """
 
     model: str | None
@@ -272,11 +273,6 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
 @lru_cache(maxsize=24)
 def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     """By its move, its places or its fixed parameters from the plant below."""
-    if source.wiring:
-        from ccd_casadi.plants.fixed_parameters import with_wiring
-
-        plant = plant_from(replace(source, wiring=UNWIRED), names, lower, upper)
-        return with_wiring(plant, source.wiring)
     if source.motion is not None:
         motion = source.motion
         size = () if motion.motor is None else (motion.motor.size,)
@@ -286,6 +282,15 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         from ccd_casadi.analysis.motor import with_motion
 
         return with_motion(plant, motion, names, source.held, count)
+    if wiring := source.wiring:
+        from ccd_casadi.plants.fixed_parameters import with_wiring
+
+        bare = replace(source, wiring=UNWIRED)
+        plant = plant_from(bare, names, lower, upper)
+        if source.wide:
+            narrow = plant_from(replace(bare, wide=False), names, lower, upper)
+            wiring = replace(wiring, own=(narrow.outputs, narrow.inputs))
+        return with_wiring(plant, wiring)
     held = source.held
     if source.places is not None:
         from ccd_casadi.plants.places import placed

@@ -226,9 +226,9 @@ def with_ports(problem: CoDesignProblem) -> CoDesignProblem:
     Returns
     -------
     CoDesignProblem
-        Itself where its plant has neither.
+        Itself where its plant has neither, and no actuator or sensor between it and its loop.
     """
-    if not plant_of(problem).ports:
+    if not plant_of(problem).ports and not problem.source.wiring:
         return problem
     return replace(problem, source=replace(problem.source, wide=True))
 

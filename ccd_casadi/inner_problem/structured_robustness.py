@@ -258,10 +258,8 @@ class DesignOnBox:
         if problem.figure is not BANDWIDTH or not uncertain.names:
             return {}
         for option, point in state_of(problem).scenarios or uncertain.corners():
-            plant = uncertain.sloped(np.array(point), option)
             further = (np.array(point) - uncertain.nominal)[:, None, None]
-            slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
-            plants.append(replace(plant, **slopes))
+            plants.append(uncertain.sloped(np.array(point), option).with_slopes_times(further))
         found = bandwidth_envelope(plants, bounds_of(problem), self.design, problem.sampling)
         gradient = [] if found is None else found.gradient.tolist()
         return dict(zip(uncertain.names, gradient, strict=False))

@@ -37,7 +37,7 @@ class Answers(NamedTuple):
     place : int array (P, k)
         Of each frequency among them, -1 where it is not one; (0, 0): nothing is known.
     held, free : complex arrays (P, F, p, m)
-        G with and without hold and delay.
+        G with hold and delay, and as a disturbing force moves it.
     """
 
     place: Any
@@ -203,7 +203,7 @@ def second(curve, number, which, v, loop):
     array (M, n, n)
     """
     at, of, g, sigma = room(loop)
-    factors, values, channel, into, out, terms, residues, T, delay, _, own, kinds = loop
+    factors, values, channel, into, out, terms, residues, T, delay, _, own, kinds, free = loop
     (m, c), p, n = into.shape, out.shape[1], g.size
     z = np.complex128
     bends, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
@@ -214,7 +214,7 @@ def second(curve, number, which, v, loop):
         ω, chain = warped(T, v[j])
         response(terms, residues, T, delay, which[j], ω, chain, False, at, G)
         if curve[j] == LoopCurve.GS:
-            response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
+            response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
         σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
         kind = broken(curve[j], number[j], p, kinds)

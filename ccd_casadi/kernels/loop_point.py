@@ -42,6 +42,8 @@ class LoopArrays(NamedTuple):
         reference, in the plants' coordinates.
     kinds : int array (channels,)
         Of these, `sections.GainOf`.
+    free : tuple of arrays
+        Terms and residues of the plants as a disturbing force moves them.
     """
 
     factors: Any
@@ -56,6 +58,7 @@ class LoopArrays(NamedTuple):
     limits: Any
     rows: Any
     kinds: Any
+    free: Any
 
 
 @compiled
@@ -316,6 +319,7 @@ def levels(curves, which, v, loop, least, answers):
     factors, values, into, outputs = loop.factors, loop.values, loop.into, loop.out
     terms, residues, T, d = loop.terms, loop.residues, loop.period, loop.delay
     limits, own, places = loop.limits, loop.rows, answers.place
+    free_terms, free_residues = loop.free
     k, matrix_room, vectors = of[K], at[M], at[V]
     p, numbers, m = outputs.shape[1], limits.shape[1], into.shape[0]
     out = np.full((count, most, curves.shape[1], numbers), -np.inf)
@@ -338,7 +342,7 @@ def levels(curves, which, v, loop, least, answers):
                 curve = curves[i, c]
                 of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
                 if curve == LoopCurve.GS and place < 0:
-                    response(terms, residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
+                    response(free_terms, free_residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
                 rows, columns, top = p, p, height
                 if not of_s or np.isnan(height):
                     rows, columns = matrix(curve, into, outputs, k, at)
@@ -391,7 +395,7 @@ def rows(curve, number, which, v, loop):
     """
     at, of, g, sigma = room(loop)
     # Unpacked once: to hand all of them to a function costs as much as a row.
-    factors, values, channel, into, out, terms, residues, T, delay, limits, own, kinds = loop
+    factors, values, channel, into, out, terms, residues, T, delay, limits, own, kinds, free = loop
     count, (m, c), p = v.size, into.shape, out.shape[1]
     value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
     x, sides = np.empty((count, p), np.complex128), np.zeros((2, count, m), np.complex128)
@@ -403,7 +407,7 @@ def rows(curve, number, which, v, loop):
             response(terms, residues, T, delay, which[j], ω, chain, True, at, G)
             closed(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
-            response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
+            response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
         σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
         level, rise = offset(curve[j], number[j], ω, chain, limits)
         for i in range(c):

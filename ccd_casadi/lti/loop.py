@@ -270,6 +270,10 @@ class Loop:
     drive, counted : array (n, q), (z, n), optional
         Where disturbing forces act and what of the states counts, where that is not the plant's own
         B and C.
+    force : array (m, n), optional
+        The force that the machine gets, where actuators make it of u.
+    names : (str, str)
+        Of what counts, and of where disturbing forces act.
     """
 
     plant: StateSpace
@@ -278,11 +282,13 @@ class Loop:
     at: tuple[BreakPoint, ...] = ()
     drive: Array | None = None
     counted: Array | None = None
+    force: Array | None = None
+    names: tuple[str, str] = ("output", "actuator")
 
     @cached_property
     def ports(self) -> Ports:
         """Where disturbing forces act, and what counts."""
-        return ports_of(self.plant, self.at, self.drive, self.counted)
+        return ports_of(self.plant, self.at, self.drive, self.counted, self.force)
 
     @property
     def ported(self) -> bool:

@@ -57,7 +57,7 @@ class BreakPoint:
 class Ports:
     """Where forces d act, what z counts, and what a setpoint s requires of them.
 
-        ẋ = A x + B u + E d,   y = C x,   z = F x = W U y + N x,   e = W s - z,   r = R s
+        ẋ = A x + B u + E d,   y = C x,   z = F x = W U y + N x,   e = W s - z,   r = R s,   f = P x
 
     Attributes
     ----------
@@ -67,6 +67,8 @@ class Ports:
         U, R with U R = 1, and W.
     beyond : array (z, n) or None
         N: what the sensors do not see of z; None: nothing.
+    force : array (m, n) or None
+        P: the force that the machine gets of its actuators, N; None: u itself.
     """
 
     drive: Array
@@ -75,6 +77,7 @@ class Ports:
     reference: Array
     wanted: Array
     beyond: Array | None = None
+    force: Array | None = None
 
 
 def course(
@@ -100,20 +103,24 @@ def course(
     if not places:
         unit = np.eye(len(plant.C))[axis]
         return unit, unit
-    output, G = np.array(places[0].output), moved_slowly(plant)[:, 0]
-    return output, G / (output @ G)
+    output, G = np.array(places[0].output), moved_slowly(plant)[..., 0]
+    return output, np.asarray((G / (G @ output)[:, None]).mean(axis=0))
 
 
 def moved_slowly(plant: StateSpace, *, slow: float = 1e-5) -> Array:
-    """G (p, m) at a real s, `slow` of the slowest pole but those of a free body."""
+    """G (2, p, m) at a real s, `slow` of the slowest pole but those of a free body, and at -s.
+
+    Of ratios in it the mean has no term of first order, as of a sensor's lag.
+    """
     rates = np.abs(plant.poles)
     moving = rates[rates > slow**2 * rates.max()]
-    return np.asarray(plant.at(np.array([slow * moving.min(initial=rates.max())]))[0].real)
+    s = slow * moving.min(initial=rates.max())
+    return np.asarray(plant.at(np.array([s, -s])).real)
 
 
 def ports_of(
     plant: StateSpace, places: Sequence[BreakPoint] = (), drive: Array | None = None,
-    counted: Array | None = None,
+    counted: Array | None = None, force: Array | None = None,
 ) -> Ports:  # fmt: skip
     """Find the ports of a plant.
 
@@ -127,6 +134,8 @@ def ports_of(
         E and F; left out, forces act at the actuators, and the outputs count, or of several sensors
         on one actuator the one of the first place. W is then what a slow force moves z by while it
         moves what follows the setpoint by one.
+    force : array (m, n), optional
+        P, where actuators make it of u.
 
     Returns
     -------
@@ -138,8 +147,9 @@ def ports_of(
         rows, reference = output[None], r[:, None]
     E = plant.B if drive is None else drive
     if counted is None:
-        return Ports(E, rows @ plant.C, rows, reference, np.eye(len(rows)))
+        return Ports(E, rows @ plant.C, rows, reference, np.eye(len(rows)), None, force)
     read = np.vstack([rows @ plant.C, counted])
     G = moved_slowly(StateSpace(plant.A, plant.B, read, np.zeros((len(read), plant.B.shape[1]))))
-    wanted = G[len(rows) :] @ np.linalg.pinv(G[: len(rows)])
-    return Ports(E, counted, rows, reference, wanted, counted - wanted @ read[: len(rows)])
+    q = len(rows)
+    wanted = (G[:, q:] @ np.linalg.pinv(G[:, :q])).mean(axis=0)
+    return Ports(E, counted, rows, reference, wanted, counted - wanted @ read[:q], force)

@@ -6,10 +6,11 @@ Each input has an actuator a_j(s) and each output a sensor c_i(s), of static gai
     a, c = 1/(1 + s/ω₁) · 1/(1 + 2ζ s/ω₂ + (s/ω₂)²)      either factor, both or none,
 
 in the loop of every search, figure, judge and deployed controller, exact at the instants behind a
-hold. So a force that GS speaks of enters before the actuator, and positions are as measured.
+hold. Disturbing forces act on the mechanics, z = C q is what counts, a motor's force is a_j u_j; a
+plant with these as further inputs and outputs says which channels are its `own`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,24 @@ class Slopes(NamedTuple):
     dA: Array
     dB: Array
     dC: Array
+
+
+@dataclass(frozen=True)
+class WiredPlant(StateSpace):
+    """A plant with its actuators and sensors.
+
+    Attributes
+    ----------
+    mechanics : StateSpace
+        Without them.
+    """
+
+    mechanics: StateSpace = field(kw_only=True)
+
+    @classmethod
+    def of(cls, wired: StateSpace, mechanics: StateSpace) -> "WiredPlant":
+        """The matrices of `wired`."""
+        return cls(wired.A, wired.B, wired.C, wired.D, mechanics=mechanics)
 
 
 @dataclass(frozen=True)
@@ -105,10 +124,14 @@ class Wiring:
     ----------
     actuator, sensor : Filters
         Before the forces; behind the sensors.
+    own : tuple (p, m) or None
+        How many outputs and inputs, the first ones, are wired; None: all. With them the actuators'
+        forces (N) are the last outputs of all.
     """
 
     actuator: Filters = Filters()
     sensor: Filters = Filters()
+    own: tuple[int, int] | None = None
 
     def __bool__(self) -> bool:
         return bool(self.actuator or self.sensor)
@@ -118,7 +141,8 @@ class Wiring:
         """What a reader of figures must know."""
         both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
         there = [f"{name} {own.words}" for name, own in both if own]
-        return f"{' and '.join(there)} in every loop; forces of GS and of steps enter before it"
+        words = "disturbing forces act on the machine, its unfiltered position counts"
+        return f"{' and '.join(there)} in every loop; {words}"
 
     def poles(self, outputs: int, inputs: int) -> np.ndarray | None:
         """The poles λ in rad/s of 1/Π(1 - s/λ) where the wiring is that of every channel alike."""
@@ -126,32 +150,56 @@ class Wiring:
         sensor = self.sensor.poles(outputs, "sensor")
         return None if actuator is None or sensor is None else np.append(actuator, sensor)
 
+    def of_output(self, row: Array) -> "Wiring":
+        """Of the one output rowᵀy. Raises PlantError where it mixes sensors that differ."""
+        there, own = np.flatnonzero(row), {}
+        for key in ("lag_hz", "second_order_hz", "damping"):
+            values = getattr(self.sensor, key)
+            seen = {values[i % len(values)] for i in there if values}
+            if len(seen) > 1:
+                raise PlantError(f"sensor.{key} differs in an output that moves; give one for both")
+            own[key] = tuple(seen)
+        return replace(self, sensor=Filters(**own))
+
     def around(self, plant: StateSpace) -> StateSpace:
-        """The plant (p x m, time in s) with its actuators and sensors."""
+        """The plant (p x m, time in s) with its actuators and sensors, a `WiredPlant` with any."""
         if not self:
             return plant
-        p, m = len(plant.C), plant.B.shape[1]
-        wired = self.actuator.system(m, "actuator").series(plant)
-        return wired.series(self.sensor.system(p, "sensor"))
+        act, own, sen = self._parts(plant)
+        return WiredPlant.of(act.series(own).series(sen), plant)
 
-    def states(self, plant: StateSpace, slopes: Slopes, rate: float) -> tuple[StateSpace, Slopes]:
+    def _parts(
+        self, plant: StateSpace, unit: float = 1.0
+    ) -> tuple[StateSpace, StateSpace, StateSpace]:
+        """Actuators, the plant and sensors, as wide as it; `unit` of its force in N."""
+        (n, inputs), outputs = plant.B.shape, len(plant.C)
+        p, m = self.own or (outputs, inputs)
+        act, sen = self.actuator.system(m, "actuator"), self.sensor.system(p, "sensor")
+        if self.own and self.actuator:
+            C, D = np.zeros((m, n)), unit * np.eye(m, inputs)
+            plant = replace(plant, C=np.vstack([plant.C, C]), D=np.vstack([plant.D, D]))
+        return _beside(act, inputs - m), plant, _beside(sen, len(plant.C) - p)
+
+    def states(
+        self, plant: StateSpace, slopes: Slopes, rate: float, unit: float
+    ) -> tuple[StateSpace, Slopes]:
         """The same of a plant whose time is in 1/`rate`, with derivatives; free bodies stay chains.
 
         Parameters
         ----------
         plant, slopes : StateSpace, Slopes
             The mechanics (n states): a zero column of A is a free body's position.
-        rate : float
-            1/s.
+        rate, unit : float
+            1/s, and of its force in N.
 
         Returns
         -------
         StateSpace, Slopes
             With the states (actuators, mechanics, sensors), free bodies parted from all others.
         """
+        act, plant, sen = self._parts(plant, unit)
+        act, sen = act.in_units(rate, 1.0), sen.in_units(rate, 1.0)
         n, m, p = len(plant.A), plant.B.shape[1], len(plant.C)
-        act = self.actuator.system(m, "actuator").in_units(rate, 1.0)
-        sen = self.sensor.system(p, "sensor").in_units(rate, 1.0)
         a, s = len(act.A), len(sen.A)
         size, own, behind = a + n + s, slice(a, a + n), slice(a + n, a + n + s)
 
@@ -161,12 +209,14 @@ class Wiring:
             whole, into = np.zeros((*lead, size, size)), np.zeros((*lead, size, m))
             out = np.zeros((*lead, p, size))
             whole[..., own, own], whole[..., own, :a], into[..., own, :] = A, B @ act.C, B @ act.D
-            whole[..., behind, own], out[..., own] = sen.B @ C, sen.D @ C
+            read = C.shape[-2]  # but the actuators' forces
+            whole[..., behind, own] = sen.B[:, :read] @ C
+            out[..., own] = sen.D[:, :read] @ C
             return whole, into, out
 
         A, B, C = placed(plant.A, plant.B, plant.C)
         A[:a, :a], B[:a] = act.A, act.B
-        A[behind, behind], C[:, behind] = sen.A, sen.C
+        A[behind, behind], C[:, behind], C[:, :a] = sen.A, sen.C, sen.D @ plant.D @ act.C
         dA, dB, dC = placed(*slopes)
         bodies = np.flatnonzero(~plant.A.any(axis=0))
         if len(bodies):
@@ -183,6 +233,12 @@ class Wiring:
 
 
 UNWIRED = Wiring()
+
+
+def _beside(system: StateSpace, more: int) -> StateSpace:
+    """A system with `more` channels that pass as they are."""
+    B, C = np.pad(system.B, [(0, 0), (0, more)]), np.pad(system.C, [(0, more), (0, 0)])
+    return StateSpace(system.A, B, C, block_diag(system.D, np.eye(more)))
 
 
 def _apart(A: Array, chain: np.ndarray) -> tuple[Array, Array]:

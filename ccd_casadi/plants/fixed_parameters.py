@@ -139,24 +139,41 @@ def with_wiring(plant: Plant, wiring: Wiring) -> Plant:
     ----------
     plant : Plant
     wiring : Wiring
+        Where it says which channels are its `own`, forces on the mechanics become further inputs,
+        and positions that no sensor filters further outputs, unless the plant has its ports there.
 
     Returns
     -------
     Plant
-        Of the same θ, whose matrices are the mechanics' own.
+        Of the same θ, whose matrices are the mechanics'.
 
     Raises
     ------
     PlantError
         A list has another number of entries than the plant has channels.
     """
-    wiring.actuator.system(plant.inputs, "actuator")
-    wiring.sensor.system(plant.outputs, "sensor")
+    p, m = wiring.own or (plant.outputs, plant.inputs)
+    wiring.actuator.system(m, "actuator")
+    wiring.sensor.system(p, "sensor")
+    more_u, more_y = (
+        wiring.own is not None and count == own
+        for count, own in ((plant.inputs, m), (plant.outputs, p))
+    )
 
     def of(evaluate: Evaluate) -> Evaluate:
-        return lambda theta: replace(evaluate(theta), wiring=wiring)
+        def at(theta: Sequence[float]) -> Mechanics:
+            found = evaluate(theta)
+            B, C, (dM, dD, dK, dB, dC) = found.B, found.C, found.derivatives
+            if more_u:
+                B, dB = np.hstack([B, B]), np.concatenate([dB, dB], axis=2)
+            if more_y:
+                C, dC = np.vstack([C, C]), np.concatenate([dC, dC], axis=1)
+            return replace(found, B=B, C=C, derivatives=(dM, dD, dK, dB, dC), wiring=wiring)
+
+        return at
 
     return reparametrised(
         plant, of, lambda theta: tuple(map(float, theta)),
+        inputs=plant.inputs + more_u * m, outputs=plant.outputs + more_y * p,
         notes=lambda theta: (*plant.notes(theta), wiring.words),
     )  # fmt: skip

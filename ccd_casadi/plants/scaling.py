@@ -1,7 +1,7 @@
 """The scaled plant and its separate channels: time, force and state units in which every loop
 looks alike."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -15,7 +15,7 @@ from ccd_casadi.lti.state_space import (
     state_scales,
     strictly_proper,
 )
-from ccd_casadi.lti.wiring import Slopes
+from ccd_casadi.lti.wiring import UNWIRED, Slopes, WiredPlant
 from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
@@ -213,6 +213,8 @@ class ScaledPlant:
     family : tuple of ScaledPlant
         The plant that a controller is designed on (free bodies: on their suspension), then those on
         which it must meet the bounds, too.
+    mechanics : ScaledPlant, optional
+        The plant without its actuators and sensors, where it has these.
     """
 
     A: Array
@@ -228,6 +230,7 @@ class ScaledPlant:
     dC: Array
     channels: tuple[ScaledChannel, ...] = ()
     family: "tuple[ScaledPlant, ...]" = ()
+    mechanics: "ScaledPlant | None" = None
 
     @property
     def free(self) -> bool:
@@ -252,7 +255,15 @@ class ScaledPlant:
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""
         w0 = self.omega_0
-        return strictly_proper(w0 * self.A, w0 / self.force * self.B, self.C.copy())
+        found = strictly_proper(w0 * self.A, w0 / self.force * self.B, self.C.copy())
+        own = self.mechanics
+        return found if own is None else WiredPlant.of(found, own.plant_si())
+
+    def with_slopes_times(self, factors: Array) -> "ScaledPlant":
+        """With each of its derivatives times a factor (n_θ, 1, 1)."""
+        own = self.mechanics
+        return replace(self, dA=factors * self.dA, dB=factors * self.dB, dC=factors * self.dC,
+                       mechanics=own and own.with_slopes_times(factors))  # fmt: skip
 
     def changes_si(self) -> list[tuple[Array, Array, Array]]:
         """∂A, ∂B and ∂C of `plant_si` to each parameter."""
@@ -287,6 +298,13 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     PlantError
         No mode is both driven and measured.
     """
+    if modal.wiring:
+        found = _scaled(modal, M_K, bare)
+        return replace(found, mechanics=_scaled(replace(modal, wiring=UNWIRED), M_K, True))
+    return _scaled(modal, M_K, bare)
+
+
+def _scaled(modal: ModalPlant, M_K: float, bare: bool) -> ScaledPlant:
     if modal.states is not None:
         return _scaled_states(modal, modal.states, M_K, bare)
     b = np.linalg.norm(modal.B, axis=1)
@@ -322,7 +340,7 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     dC[:, :, :n] = modal.dC * right / s
     if modal.wiring:
         plant, slopes = strictly_proper(A, B, C), Slopes(dA, dB, dC)
-        plant, (dA, dB, dC) = modal.wiring.states(plant, slopes, omega_0)
+        plant, (dA, dB, dC) = modal.wiring.states(plant, slopes, omega_0, M_K)
         A, B, C = plant.A, plant.B, plant.C
     if bare:
         none = np.empty(0)
@@ -349,7 +367,7 @@ def _scaled_states(
     )  # fmt: skip
     plant = strictly_proper(A * t / t[:, None], B / t[:, None], C * t)
     if modal.wiring:
-        plant, slopes = modal.wiring.states(plant, slopes, omega_0)
+        plant, slopes = modal.wiring.states(plant, slopes, omega_0, M_K)
     parts = (np.empty(0), np.empty(0)) if bare else _gains(plant.A, plant.B, plant.C)
     return ScaledPlant(
         plant.A, plant.B, plant.C, omega_0, M_K, *parts, modal.natural, *slopes

@@ -16,6 +16,7 @@ from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.gain_figures import of_plants
@@ -58,8 +59,9 @@ def move_blocks_of(
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        refused = ahead is None or problem.source.wiring  # by a [move]: on a spring, or filtered
-        own = "robustness takes another" if refused else "set your own under [move]"
+        own = "set your own under [move]"
+        if ahead is None:  # on a spring, which a [move] refuses
+            own = "robustness takes another"
         other = f"; {own}"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
@@ -113,6 +115,8 @@ def cycle_chapter(
     k, R, _ = motor.at(found.mass)
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
     force = profile.at(time).T @ found.forward
+    if problem.source.wiring.actuator:  # of whose command all but this makes up for its lag
+        force = np.outer(profile.at(time)[2], forces)
     heat = R / k**2 * (np.outer(profile.at(time)[2], forces) ** 2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(shown["power"], "mean")
@@ -157,7 +161,7 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
     mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, spoken("m")))
     step = f"y after a step of {spoken('1 N')} ({unit})"
     panel = c.Panel("time (ms)", step, curves, bands, marks=(mark,))
-    scalar = view.scalar and not loops[0].ported
+    scalar = view.scalar and loops[0].names == Loop.names
     words = paragraph("report.force", most, len(loops), scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
@@ -167,7 +171,7 @@ def move_blocks(found: "OnHardware") -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
     words = "Free bodies are free. Hold and delay are exact."
-    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
+    peak = max(float(move.peak_command.max()) for move in list(found.ways.values())[:2])
     limit = c.Words(paragraph("report.least_force", found, peak))
     return ways_figure(ways, words), limit
 
@@ -204,15 +208,18 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,), legend=None))
     lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    figures = dict(FIGURES)
+    if first.command is not None:
+        figures["peak command, N"] = lambda m: float(m.peak_command.max())
     rows = tuple(
-        (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()
+        (name, *(max(map(read, each)) for read in figures.values())) for name, each in ways.items()
     )
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
         f"{with_unit(first.window, spoken('m'))}. {words}"
     )
-    table = c.Table(("way", *map(spoken, FIGURES)), rows)
+    table = c.Table(("way", *map(spoken, figures)), rows)
     return c.Figure(lines, caption, (table, *tables_of(lines)))
 
 

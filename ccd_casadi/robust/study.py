@@ -303,5 +303,6 @@ def _move(move: Move) -> dict[str, Any]:
     shown = ("feedforward", "settling", "rms_error", "peak_error", "final_error")
     return {key: getattr(move, key) for key in shown} | {
         "peak_force": move.peak_force.tolist(),
+        "peak_command": move.peak_command.tolist(),
         "rms_force": move.rms_force.tolist(),
     }

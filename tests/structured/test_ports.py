@@ -293,7 +293,6 @@ def test_a_plant_without_ports_is_as_it_was(tmp_path: Path) -> None:
         ("S_max = 2.5", "S_max = 2.5\ncompliance_max = 1e-4", "inner.compliance_max"),
         ("S_max = 2.5", 'S_max = 2.5\nminimise = "rms_error"', "inner.minimise"),
         ('structure = "sections"', 'structure = "h_infinity"', "full order"),
-        ("[weights]", "[sensor]\nlag_hz = 900.0\n[weights]", r"\[sensor\]"),
     ],
 )
 def test_what_does_not_know_them_is_named(

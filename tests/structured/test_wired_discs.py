@@ -73,7 +73,7 @@ def test_discs_hold_the_plant_behind_its_wiring(ground: float, run: Sampling | N
             omega = at[0, k] * (UNIT if run is None else 1.0 / run.period)
             (G,) = uncertain.as_written([(0, at[1:, k])])
             exact = plain(G, omega) if run is None else held(G, run, omega)
-            for discs, value in ((loop, exact), (free, plain(G, omega))):
+            for discs, value in ((loop, exact), (free, plain(G.mechanics, omega))):
                 off = abs(value - discs.middle[:, k] @ scale)
                 radius = discs.radius[:, k] @ np.abs(scale)
                 assert off <= radius * (1.0 + 1e-9) + 1e-9 * abs(value)
@@ -101,7 +101,7 @@ def test_free_bodies_at_rest_are_enclosed_times_y_squared(run: Sampling | None) 
         omega = w[k] * (UNIT if run is None else 1.0 / run.period)
         y = 1j * w[k] if period is None else 2j / period * np.sin(w[k] / 2.0)
         exact = plain(G, omega) if run is None else held(G, run, omega)
-        for discs, value in ((loop, exact), (free, plain(G, omega))):
+        for discs, value in ((loop, exact), (free, plain(G.mechanics, omega))):
             value = value * (y * UNIT) ** 2
             assert abs(discs.middle[body, k] - value) <= discs.radius[body, k] + 1e-9
             assert discs.radius[body, k] < 1e-6

@@ -151,7 +151,6 @@ omega_low_hz = 1.0
         ("[sensor]\nlag_hz = 0.0", "sensor.lag_hz: is 0.0; give Hz from 0.01 to 1e7"),
         ("[sensor]\nlag_hz = 1e12", "sensor.lag_hz: is 1000000000000.0; give Hz from 0.01 to 1e7"),
         ("[sensor]\nsecond_order_hz = 1e3\ndamping = 1e9", "give a damping ratio from 0.001"),
-        ('[actuator]\nlag_hz = 100.0\n[budget.force]\nlevel = 1.0\nunit = "N"', "budget"),
     ],
 )
 def test_what_a_wiring_cannot_be_is_told_by_key(tmp_path, table: str, words: str) -> None:

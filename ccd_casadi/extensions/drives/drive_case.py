@@ -60,6 +60,9 @@ def drive_problem(case: Case, theta: Sequence[float] | None = None) -> DriveProb
             raise UserError("loop.rate_hz is missing; a drive is sampled, give its rate")
         if most is None:
             refuse_ports(problem, "[drive] without inner.compliance_max")
+        elif problem.source.wiring:
+            words = "inner.compliance_max beside [actuator] or [sensor] is not known to it"
+            raise UserError(f"{words}; drop one of the two")
         bounds = replace(bounds_of(problem), compliance_max=most)
         at = problem.start if theta is None else tuple(theta)
         if (travel := _travel(table.lead_mm, problem, at)) is not None:

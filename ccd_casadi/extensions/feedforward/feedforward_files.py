@@ -20,6 +20,7 @@ from ccd_casadi.extensions.feedforward.move_responses import (
     responses_of,
 )
 from ccd_casadi.extensions.feedforward.set_feedforward import SetFeedforward
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import run_name
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -205,10 +206,11 @@ def improved(
     profile = Setpoint(durations, snaps, np.nan, np.nan, np.nan)  # the largest are not needed
     if not before["contraction"] < 1.0:
         raise UserError(f"{path}: learning does not converge on every plant of its set")
-    if run.loop.at or run.loop.ported:
+    if run.loop.at or run.loop.names != Loop.names:
         words = "learning is for loops whose error counts at their sensors, one for each actuator"
         raise UserError(f"{path}: {words}")
-    model = responses_of(run.loop, profile, shape.orders, axis=before["axis"] - 1,
+    own = replace(run.loop, drive=None, counted=None)  # the log has the error that K reads
+    model = responses_of(own, profile, shape.orders, axis=before["axis"] - 1,
                          samples=before["samples"])  # fmt: skip
     count, q = model.reached.shape[:2]
     if error.shape[1] != q:

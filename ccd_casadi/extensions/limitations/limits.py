@@ -206,7 +206,9 @@ def limits_of(
     one = plant.B.shape[1] == 1 and len(plant.C) == 1
     roots = (row[0].zeros, row[0].poles) if one else (np.empty(0, complex),) * 2
     beyond, growing = (tuple(part[part.real > outside * np.abs(part)].tolist()) for part in roots)
-    free = response_of(plant) if one and bounds.compliance_max is not None else None
+    free = None
+    if one and bounds.compliance_max is not None:
+        free = response_of(getattr(plant, "mechanics", plant))  # on which disturbing forces act
     return Limits(name, bounds, row, free, period, beyond, ratio, integrator, unstable=growing)
 
 
