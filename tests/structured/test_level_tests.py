@@ -108,10 +108,10 @@ def test_what_no_proof_covers_is_not_passed(outcome: ProofOutcome) -> None:
     for channels in (False, True):
         proof = Proof(outcome, 1e-3, ("shift",), {"KS": 1.0}, channels=channels, point=(0.1,),
                       passed=("KS", 1.1))  # fmt: skip
-        assert bool(proof.unasked) == (channels or outcome in NOT_APPLICABLE)
-        if proof.unasked and (proof.stable or outcome in NOT_APPLICABLE):
+        assert bool(proof.unproven) == (channels or outcome in NOT_APPLICABLE)
+        if proof.unproven and (proof.stable or outcome in NOT_APPLICABLE):
             assert "not proven" in proof.words
-            assert proof.unasked in proof.words
+            assert proof.unproven in proof.words
         assert ("proven for the whole box" in proof.words) == proof.proven
     assert survives(None, S_max=2.0, own=OwnSet.SEARCHED).state is State.UNKNOWN
 
