@@ -206,8 +206,8 @@ def needed_words(found: "Deployment") -> str:
     str
         A few words, after the rate and the delay.
     """
-    if found.designed is not None:
-        return f"designed for {_own(found.designed)}"
+    if found.designed_for is not None:
+        return f"designed for {_own(found.designed_for)}"
     if found.needed_hz is None:
         return "no rate will do"
     return f"needed {found.needed_hz:.5g} Hz"
@@ -229,9 +229,9 @@ def shortfall_words(found: "Deployment") -> str:
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
     missed, needed = found.shortfalls[0], found.needed_hz
-    if found.designed is not None:
+    if found.designed_for is not None:
         at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
-        return f"{at}: {missed}; {_of_design(found, found.designed)}"
+        return f"{at}: {missed}; {_of_design(found, found.designed_for)}"
     rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
     if needed is None:
         return f"{rate} is not enough: {missed}; with this delay no rate is; shorten the delay"

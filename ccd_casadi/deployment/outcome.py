@@ -40,7 +40,8 @@ class ChannelOrders:
     rows : tuple of ReducedController
         The full order first.
     chosen, strict : ReducedController
-        The one deployed, and the least that keeps S_max as the design does.
+        The one deployed, and the one of least order that keeps S_max without the share of it that
+        a reduction may spend.
     designed : (Structure, array) or None
         Structure and κ (SI) of sections, which are deployed as they are.
     """
@@ -63,7 +64,7 @@ class Deployment:
     limits, reduced, reduced_figures : LoopLimits, StateSpace, DesignFigures
         What the reduction keeps, K(s) after it, SI, and its loop.
     needed_hz : float or None
-        The least rate that is enough, of those of a design its own; None where none is.
+        The least rate that is enough; that of a design for a rate is this rate. None where none is.
     target : Target
         What the sampled loop keeps.
     rate_hz, delay : float
@@ -78,12 +79,12 @@ class Deployment:
         Why the run itself is not verified; empty where it is.
     statics : Statics or None
         Of the loop at rest.
-    compliance, compliance_max : (Perturbation, float), float
-        The largest |GS| in m/N and on which plant, and its bound, where the case has one.
+    compliance, compliance_max : (Perturbation, float) or None, float or None
+        On which plant |GS| is largest, and it in m/N; its bound, where the case has one.
     judge : Judgement or None
         Of the code's coefficients on the plants as their function returned them.
-    designed : Sampling or None
-        How the loop was designed to run; None where K(s) was designed.
+    designed_for : Sampling or None
+        The rate and delay that the loop was designed for; None where K(s) was designed.
     between : BetweenSamples or None
         S between the samples, on the plants with the largest peaks at the instants; None of an
         unstable loop.
@@ -111,7 +112,7 @@ class Deployment:
     compliance: tuple[Perturbation, float] | None = None
     compliance_max: float | None = None
     judge: Judgement | None = None
-    designed: Sampling | None = None
+    designed_for: Sampling | None = None
     between: BetweenSamples | None = None
     rounding: RoundingBound | None = None
     integer_faults: tuple[str, ...] = ()
@@ -122,25 +123,31 @@ class Deployment:
         return len(self.reduced.A)
 
     @property
+    def loops(self) -> tuple[MemberLoop, ...]:
+        """The sampled loop on every plant, the nominal one first."""
+        return (MemberLoop(Perturbation(), self.sampled), *self.members)
+
+    @property
     def stable(self) -> bool:
         """Whether the sampled loop is stable on every plant."""
-        return self.sampled.stable and all(item.figures.stable for item in self.members)
+        return all(loop.figures.stable for loop in self.loops)
 
     @property
     def worst(self) -> MemberLoop:
-        """The plant with the largest peak of the sampled S, the nominal one among them."""
-        nominal = MemberLoop(Perturbation(), self.sampled)
-        return max((nominal, *self.members), key=lambda item: item.badness)
+        """The plant with the largest peak of the sampled S."""
+        return max(self.loops, key=lambda loop: loop.badness)
 
     @property
     def shortfalls(self) -> tuple[str, ...]:
-        """What is not kept, on which plant, with its figure; empty where all is."""
-        found = []
-        for item in (MemberLoop(Perturbation(), self.sampled), *self.members):
-            nominal = item.at == Perturbation()
-            if not (self.target.met if nominal else self.target.held)(item.figures):
-                found.append((item.badness, f"{_fault(self, item)} ({place_words(item.at)})"))
-        words = [w for _, w in sorted(found, key=lambda pair: -pair[0])]
+        """What is not kept, on which plant, with its figure, the worst plant first.
+
+        ω_b is held to its tolerance on the nominal plant alone: on the others it moves with them.
+        """
+        nominal, *others = self.loops
+        failed = [] if self.target.met(nominal.figures) else [nominal]
+        failed += [loop for loop in others if not self.target.held(loop.figures)]
+        failed.sort(key=lambda loop: -loop.badness)
+        words = [f"{_fault(self.target, one.figures)} ({place_words(one.at)})" for one in failed]
         if self.compliance is not None and self.compliance_max is not None:
             at, gain = self.compliance
             if gain > (1.0 + self.target.excess) * self.compliance_max:
@@ -151,7 +158,7 @@ class Deployment:
         return (*words, *self.integer_faults)
 
     @property
-    def levels(self) -> tuple[Finding, ...]:
+    def weighted_above(self) -> tuple[Finding, ...]:
         """The weighted functions that exceed `weighted_level` by more than `excess` in the code."""
         figures = {} if self.judge is None else self.judge.figures
         return tuple(
@@ -166,14 +173,14 @@ class Deployment:
         return not self.shortfalls and not self.unverified
 
 
-def _fault(found: Deployment, item: MemberLoop) -> str:
-    f = item.figures
-    if not f.stable:
-        return f"unstable: spectral radius {f.spectral_radius:.6g}"
-    if f.sensitivity_peak > found.target.peak:
-        return f"peak of S {missed_by(f.sensitivity_peak, found.target.S_max)}"
-    change = 100.0 * (f.bandwidth / found.target.bandwidth - 1.0)
-    return f"bandwidth {f.bandwidth / HZ:.6g} Hz ({change:+.2f} %)"
+def _fault(target: Target, figures: SampledFigures) -> str:
+    """The first of stability, peak and bandwidth that a loop does not keep."""
+    if not figures.stable:
+        return f"unstable: spectral radius {figures.spectral_radius:.6g}"
+    if figures.sensitivity_peak > target.peak:
+        return f"peak of S {missed_by(figures.sensitivity_peak, target.S_max)}"
+    change = 100.0 * (figures.bandwidth / target.bandwidth - 1.0)
+    return f"bandwidth {figures.bandwidth / HZ:.6g} Hz ({change:+.2f} %)"
 
 
 def status_words(run: FinishedRun, found: Deployment) -> str:
@@ -207,7 +214,7 @@ def short_status(run: FinishedRun, found: Deployment) -> str:
     """
     if not found.passed:
         return "not verified"
-    if _over(run, found) > 0.0:
+    if _percent_over(run, found) > 0.0:
         return f"verified to {100.0 * found.target.excess:.2g} % of S_max"
     return "verified"
 
@@ -244,19 +251,18 @@ def deployed_line(run: FinishedRun, found: Deployment, moved: OnHardware | None 
         "rounding": None if found.rounding is None else found.rounding.largest,
         "between_samples": None if found.between is None else found.between.entry,
     }
-    line = partial(Check, "deployable", figures=figures)
+    check = partial(Check, "deployable", figures=figures)
     if found.shortfalls:
-        return line(State.FAILED, (Reason.SHORTFALL(words=found.shortfalls[0]),))
-    on_model = Reason.DEPLOYED_ON_MODEL if found.members else Reason.DEPLOYED
-    kept = [on_model(**_loop_entry(K))]
+        return check(State.FAILED, (Reason.SHORTFALL(words=found.shortfalls[0]),))
+    nominal = Reason.DEPLOYED_ON_MODEL if found.members else Reason.DEPLOYED
+    doubts, kept = [*reasons(run, found), *found.weighted_above], [nominal(**_loop_entry(K))]
     if found.members and worst.figures is not K:
         plant = place_words(worst.at)
         kept.append(Reason.WORST_PLANT(plant=plant, **_loop_entry(worst.figures)))
-    move = figures["move"] or {}
-    ends = {State.FAILED: Reason.MOVE_NOT_SETTLED, State.UNKNOWN: Reason.MOVE_UNKNOWN}
-    ended = ends.get(move.get("state", State.PASSED))
-    doubts = [*reasons(run, found), *found.levels]
-    doubts += [ended(force_limit=move["force_limit"])] if ended else []
+    if move := figures["move"]:
+        unsettled = {State.FAILED: Reason.MOVE_NOT_SETTLED, State.UNKNOWN: Reason.MOVE_UNKNOWN}
+        if reason := unsettled.get(move.get("state", State.PASSED)):
+            doubts.append(reason(force_limit=move["force_limit"]))
     if found.between is not None:
         above, finding = between_finding(
             found.between, found.target.S_max, found.target.excess + VerdictOptions.between_excess
@@ -264,11 +270,11 @@ def deployed_line(run: FinishedRun, found: Deployment, moved: OnHardware | None 
         (doubts if above else kept).append(finding)
     if found.rounding is not None:
         kept.append(rounding_finding(found.rounding))
-    return line(State.WARNED if doubts else State.PASSED, (*doubts, *kept))
+    return check(State.WARNED if doubts else State.PASSED, (*doubts, *kept))
 
 
 def _loop_entry(found: SampledFigures) -> dict[str, float]:
-    """Of one plant."""
+    """The figures of a finding about the loop on one plant."""
     return {"bandwidth_hz": found.bandwidth / HZ, "sensitivity_peak": found.sensitivity_peak}
 
 
@@ -335,8 +341,8 @@ def against(peak: float, S_max: float) -> str:
     return f"{abs(over):.2f} % {'above' if over > 0.0 else 'below'} S_max" if over else "S_max"
 
 
-def _over(run: FinishedRun, found: Deployment) -> float:
-    """How far the largest peak exceeds S_max, in %."""
+def _percent_over(run: FinishedRun, found: Deployment) -> float:
+    """By how many percent the largest peak exceeds S_max; negative below it."""
     peak = found.worst.figures.sensitivity_peak
     return 100.0 * (peak / run.problem.inner.S_max - 1.0)
 
@@ -358,13 +364,13 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
 
 
 def reasons(run: FinishedRun, found: Deployment) -> list[Finding]:
-    """The same as findings."""
+    """The findings of `reason_words`; of several plants that fall short that of the worst alone."""
     parts = [Reason.RUN_NOT_VERIFIED(words=found.unverified)] if found.unverified else []
     if share := run.case.robust.share_words:
         parts.append(Reason.SHARE_ALONE(claim=share, plants=1 + len(found.members)))
     if found.shortfalls:
         return [*parts, Reason.JUDGED(words=found.shortfalls[0])]
-    over, plant = _over(run, found), place_words(found.worst.at) if found.members else ""
+    over, plant = _percent_over(run, found), place_words(found.worst.at) if found.members else ""
     if over > 0.0:
         S_max, excess = run.problem.inner.S_max, found.target.excess
         parts.append(Reason.PEAK_ABOVE(over=over, S_max=S_max, excess=excess, plant=plant))

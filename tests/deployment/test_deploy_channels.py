@@ -169,8 +169,8 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
         other = replace(run.problem.controller, weighted_level=share * largest)
         of_other = replace(run, problem=replace(run.problem, controller=other))
         again = replace(found, judge=_judged(of_other, found))
-        assert deployed_line(run, again).state == state, again.levels
-        assert any("3.33 times weighted_level" in one.words() for one in again.levels) == (
+        assert deployed_line(run, again).state == state, again.weighted_above
+        assert any("3.33 times weighted_level" in one.words() for one in again.weighted_above) == (
             share < 1.0
         )
     wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))

@@ -299,7 +299,7 @@ def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
     found = SimpleNamespace(
         sampled=model, worst=worst, members=(worst,), rate_hz=1e4, delay=1e-4, needed_hz=1e4,
         realisation=SimpleNamespace(system=SimpleNamespace(A=np.zeros((4, 4)))), stable=True,
-        shortfalls=(), levels=(), unverified="", judge=None, rounding=None, between=None,
+        shortfalls=(), weighted_above=(), unverified="", judge=None, rounding=None, between=None,
         target=SimpleNamespace(excess=0.05),
     )  # fmt: skip
     run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)),
