@@ -27,8 +27,8 @@ from ccd_casadi.sampling.inner_samples import (
     quantity_sample,
     spent_entry,
 )
-from ccd_casadi.sampling.sample_keys import hashes_of, problem_hash
 from ccd_casadi.sampling.store import Sample, SampleStore
+from ccd_casadi.sampling.units import hashes_of, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, sobol

@@ -4,8 +4,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.sampling.sample_keys import problem_hash
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.units import problem_hash
 from ccd_casadi.support.errors import require
 from ccd_casadi.support.text import HZ
 
