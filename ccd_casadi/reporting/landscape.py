@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationRound
+from ccd_casadi.codesign.outer_problem import FormulationRound
 from ccd_casadi.drawing.content import (
     Band,
     Curve,

@@ -17,7 +17,7 @@ from oracles.helpers import problem
 
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
+from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import result_dict
 from ccd_casadi.codesign.run import outer_of
