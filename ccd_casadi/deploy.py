@@ -196,17 +196,7 @@ class TimingWordsOptions:
 
 
 def needed_words(found: "Deployment") -> str:
-    """What the loop was designed for, or the least rate that it needs.
-
-    Parameters
-    ----------
-    found : Deployment
-
-    Returns
-    -------
-    str
-        A few words, after the rate and the delay.
-    """
+    """What the loop was designed for, or the least rate that it needs."""
     if found.designed_for is not None:
         return f"designed for {_own(found.designed_for)}"
     if found.needed_hz is None:
@@ -215,18 +205,7 @@ def needed_words(found: "Deployment") -> str:
 
 
 def shortfall_words(found: "Deployment") -> str:
-    """What is not kept, why, and what to change.
-
-    Parameters
-    ----------
-    found : Deployment
-        Not passed.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """What is not kept, why, and what to change."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
     missed, needed = found.shortfalls[0], found.needed_hz
