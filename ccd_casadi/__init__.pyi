@@ -28,8 +28,8 @@ from ccd_casadi.plants.measured import read_frequency_response as read_frequency
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace
+from ccd_casadi.reporting.notebook import samples_frame as samples_frame
 from ccd_casadi.robust.study import robustness as robustness
-from ccd_casadi.sampling.frames import samples_frame as samples_frame
 from ccd_casadi.studies.comparison import compare as compare
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.text import HZ as HZ

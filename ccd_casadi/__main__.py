@@ -29,6 +29,7 @@ COMMANDS = {
 ALIASES = {"import": "imported"}
 TEMPLATE = {"plant.py": "new_plant.py", "case.toml": "case.toml"}  # file -> in templates/
 SCHEMA = "case.schema.json"
+# Words that are answered here, each with what it does.
 OWN = {
     "new": "write a plant and a case to begin with into a new folder",
     "keys": "list every table and key of a case file, as Markdown",
@@ -39,13 +40,11 @@ OWN = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word names; without one, say what there is to do here."""
     words = list(sys.argv[1:] if argv is None else argv)
-    named = ALIASES.get(words[0], words[0]) if words else ""
-    if named in COMMANDS:
-        return int(import_module(COMMANDS[named][0]).main(words[1:]))
-    if named in extensions.SHIPPED["commands"] or (
-        _is_new(named) and extensions.find("commands", named)
-    ):
-        return extensions.command(named)(words[1:])
+    command = ALIASES.get(words[0], words[0]) if words else ""
+    if command in COMMANDS:
+        return int(import_module(COMMANDS[command][0]).main(words[1:]))
+    if command in extensions.SHIPPED["commands"] or _is_foreign(command):
+        return extensions.command(command)(words[1:])  # which names an extension that was removed
     raise_on_ctrl_c()
     match words:
         case [] | ["--help" | "-h" | "help"]:
@@ -63,10 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         case ["new", name] if not name.startswith("-"):
             return new(Path(name))
         case [word, *more] if word in OWN:
-            about = f"ccd {word}{' NAME' if word == 'new' else ''}: {OWN[word]}"
+            usage = f"ccd {word}{' NAME' if word == 'new' else ''}: {OWN[word]}"
             if more not in (["--help"], ["-h"]):
-                return _refuse(about)
-            print(about)
+                return _refuse(usage)
+            print(usage)
         case _:
             there = ", ".join((*commands(), *OWN))
             return _refuse(f"{words[0]!r} is not a command; there are {there}")
@@ -78,18 +77,21 @@ def commands() -> dict[str, tuple[str, str]]:
     return COMMANDS | extensions.declared("commands")
 
 
-def _is_new(word: str) -> bool:
-    """Whether a word may be of an extension of another distribution, whose tables take time."""
-    return word.isidentifier() and word not in OWN and word != "help"
+def _is_foreign(word: str) -> bool:
+    """Whether a word is a command of another distribution; only then are its tables read."""
+    may_be = word.isidentifier() and word not in OWN and word != "help"
+    return may_be and extensions.find("commands", word) is not None
 
 
 def _refuse(words: str) -> int:
+    """Write one line on stderr."""
     say(one_line(words), sys.stderr)
     return ExitCode.BAD_INPUT
 
 
 def _schema() -> ModuleType:
-    return import_module("ccd_casadi.cases.case")  # loads the models of the package
+    """The module of `keys_page` and `case_schema`; it loads the models of the package."""
+    return import_module("ccd_casadi.cases.case")
 
 
 def new(folder: Path) -> int:

@@ -69,7 +69,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.fixed_point import FixedRequest
     from ccd_casadi.deployment.integer_loop import integer_faults
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
-    from ccd_casadi.deployment.outcome import deployed_line
+    from ccd_casadi.deployment.outcome import DeployedRun
     from ccd_casadi.deployment.pipeline import deploy
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
@@ -141,7 +141,7 @@ def main(options: argparse.Namespace) -> ExitCode:
                 (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
         if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    line = deployed_line(finished, found, moved)
+    line = DeployedRun(finished, found).check(moved)
     finished = with_verdict_line(finished, folder, line)
     # a folder elsewhere leaves the run as it is, but the decision here is on what was deployed
     verdict = finished.result.get("verdict")
@@ -169,14 +169,15 @@ def _summary(
     run: "FinishedRun", found: "Deployment", moved: "OnHardware | None", judged: dict[str, Any]
 ) -> str:
     from ccd_casadi.deployment.integer_loop import integer_words
-    from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
+    from ccd_casadi.deployment.outcome import DeployedRun
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.reporting.decision import advice
     from ccd_casadi.support.text import template
 
+    deployed = DeployedRun(run, found)
     return template("templates/deploy.txt", place_words=place_words).render(
-        d=found, status=status_words(run, found), decision=advice(judged),
-        needed=needed_words(found), order=order_words(run, found), figures=figure_rows(run, found),
+        d=found, status=deployed.status, decision=advice(judged),
+        needed=needed_words(found), order=deployed.order, figures=deployed.rows,
         integers=integer_words(found.realisation.fixed, found.rounding, moved),
     ).rstrip()  # fmt: skip
 
@@ -195,43 +196,22 @@ class TimingWordsOptions:
 
 
 def needed_words(found: "Deployment") -> str:
-    """What the loop was designed for, or the least rate that it needs.
-
-    Parameters
-    ----------
-    found : Deployment
-
-    Returns
-    -------
-    str
-        A few words, after the rate and the delay.
-    """
-    if found.designed is not None:
-        return f"designed for {_own(found.designed)}"
+    """What the loop was designed for, or the least rate that it needs."""
+    if found.designed_for is not None:
+        return f"designed for {_own(found.designed_for)}"
     if found.needed_hz is None:
         return "no rate will do"
     return f"needed {found.needed_hz:.5g} Hz"
 
 
 def shortfall_words(found: "Deployment") -> str:
-    """What is not kept, why, and what to change.
-
-    Parameters
-    ----------
-    found : Deployment
-        Not passed.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """What is not kept, why, and what to change."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
     missed, needed = found.shortfalls[0], found.needed_hz
-    if found.designed is not None:
+    if found.designed_for is not None:
         at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
-        return f"{at}: {missed}; {_of_design(found, found.designed)}"
+        return f"{at}: {missed}; {_of_design(found, found.designed_for)}"
     rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
     if needed is None:
         return f"{rate} is not enough: {missed}; with this delay no rate is; shorten the delay"

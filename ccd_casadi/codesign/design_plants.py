@@ -12,9 +12,9 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign

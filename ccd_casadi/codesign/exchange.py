@@ -1,18 +1,20 @@
 """A good combination of listed values by exchanges, before branch and bound.
 
-From the combination that is nearest to an optimum between the values, at the θ of that optimum,
+A combination z gives every list one of its values; θ(z) has these, and all else as at an optimum
+between the values. From the combination nearest to that optimum,
 
-    z <- z'  where  J(θ, z') < J(θ, z),   z' from the exchanges of z that keep λ(θ, z') <= 0,
+    z <- z'  where  J(θ(z')) < J(θ(z)),   z' an exchange of z with λ(θ(z')) <= 0,
 
 until no exchange lowers J or the time is up. An exchange moves one list to a value beside its own;
-where none of these keeps λ (a number of places is given) two lists move at once. J is true: the
-inner problem is solved at every z', many at once. Branch and bound then begins with a design that
-is judged, and cuts with it if it is verified.
+where none of these keeps λ (a number of places is given) it moves two lists at once. J is true: the
+inner problem is solved at every z', nearest first, a batch at a time; the best z' of the first
+batch that lowers J is taken. Branch and bound then begins with a design that is judged, and cuts
+with it if it is verified.
 
 Source: exchange neighbourhoods of facility location (Cornuejols, Nemhauser and Wolsey, 1990).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,12 +23,12 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import ConstraintOptions, constraint_sizes, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.time_budget import ends_early, stage
 
-Values = dict[str, float]
+Values = dict[str, float]  # a combination z, by name
+Ranked = tuple[tuple[float, float], Values]  # J, the violation that decides where J is infinite, z
 
 
 @dataclass(frozen=True)
@@ -72,57 +74,50 @@ def best_exchange(
         The best combination that was found, and how many were evaluated.
     """
     problem, keeps = sampler.problem, _keeps_constraints(sampler.problem)
-    size, count = options.batch * sampler.workers.count, 0
-
-    def evaluated(some: Sequence[Values]) -> list[tuple[tuple[float, float], Values]]:
-        nonlocal count
-        points = np.array([_point(problem, theta, one) for one in some])
-        found = sampler.values(points, "exchanging listed values")
-        ranked = [(_rank(problem, sample), one) for sample, one in zip(found, some, strict=True)
-                  if sample.searched]  # fmt: skip
-        count += len(ranked)
-        return ranked
-
-    def allowed(some: Iterable[Values]) -> list[Values]:
-        rows = list(some)
-        points = np.array([_point(problem, theta, one) for one in rows])
-        return [one for one, kept in zip(rows, keeps(points), strict=True) if kept] if rows else []
-
+    size = options.batch * sampler.workers.count
     tried = {tuple(begin.values())}
+    count = 0
+
+    def points(some: Sequence[Values]) -> Array:
+        return np.array([[z.get(name, theta[name]) for name in problem.names] for z in some])
+
+    def evaluated(some: Sequence[Values]) -> list[Ranked]:
+        nonlocal count
+        samples = sampler.values(points(some), "exchanging listed values")
+        found = [((objective_of(problem, sample), sample.violation), z)
+                 for sample, z in zip(samples, some, strict=True) if sample.searched]  # fmt: skip
+        count += len(found)
+        return found
+
+    def allowed(some: list[Values]) -> list[Values]:
+        return [z for z, kept in zip(some, keeps(points(some)), strict=True) if kept]
+
+    def nearest_first(some: list[Values]) -> list[Values]:
+        here = np.array([theta[name] for name in problem.names])
+        width = np.subtract(problem.upper, problem.lower)
+        away = (np.abs(points(some) - here) / width).sum(axis=1)
+        return [some[i] for i in np.argsort(away, kind="stable")]
+
+    def lower_than(best: Ranked) -> Ranked | None:
+        exchanges = _exchanges(listed, best[1], allowed)
+        fresh = [z for z in exchanges if tuple(z.values()) not in tried]
+        fresh = nearest_first(fresh) if fresh else []
+        for i in range(0, len(fresh), size):
+            if ends_early("listed exchange", len(fresh) - i):
+                return None
+            some = fresh[i : i + size]
+            tried.update(tuple(z.values()) for z in some)
+            least = min([best, *evaluated(some)], key=lambda ranked: ranked[0])
+            if least is not best:
+                return least
+        return None
+
     with stage(options.share):
-        best = min(evaluated([begin]), key=lambda pair: pair[0], default=None)
-        going = best is not None
-        while going and best is not None:
-            going = False
-            fresh = [one for one in _exchanges(listed, best[1], allowed)
-                     if tuple(one.values()) not in tried]  # fmt: skip
-            fresh.sort(key=lambda one: _away(problem, theta, one))
-            for i in range(0, len(fresh), size):
-                if ends_early("listed exchange", len(fresh) - i):
-                    break
-                some = fresh[i : i + size]
-                tried |= {tuple(one.values()) for one in some}
-                least = min([best, *evaluated(some)], key=lambda pair: pair[0])
-                if least is not best:
-                    best, going = least, True
-                    break
-    return (begin if best is None else best[1]), count
-
-
-def _rank(problem: CoDesignProblem, sample: InnerSample) -> tuple[float, float]:
-    """J, and of two without a design by how much they fall short."""
-    return objective_of(problem, sample), sample.violation
-
-
-def _point(problem: CoDesignProblem, theta: Mapping[str, float], one: Values) -> Array:
-    return np.array([one.get(name, theta[name]) for name in problem.names])
-
-
-def _away(problem: CoDesignProblem, theta: Mapping[str, float], one: Values) -> float:
-    """How far a combination is from the optimum between the values, in shares of the ranges."""
-    here = np.array([theta[name] for name in problem.names])
-    width = np.subtract(problem.upper, problem.lower)
-    return float((np.abs(_point(problem, theta, one) - here) / width).sum())
+        found = evaluated([begin])
+        best, lower = begin, found[0] if found else None
+        while lower is not None:
+            best, lower = lower[1], lower_than(lower)
+    return best, count
 
 
 def _keeps_constraints(problem: CoDesignProblem) -> Callable[[Array], Array]:
@@ -132,7 +127,7 @@ def _keeps_constraints(problem: CoDesignProblem) -> Callable[[Array], Array]:
     evaluate = ca.Function("shares", [x], [shares])
 
     def keeps(points: Array) -> Array:
-        if not shares.numel():
+        if not shares.numel() or not points.size:
             return np.ones(len(points), bool)
         return np.asarray((evaluate(points.T).full() <= ConstraintOptions.met).all(axis=0))
 
@@ -141,15 +136,14 @@ def _keeps_constraints(problem: CoDesignProblem) -> Callable[[Array], Array]:
 
 def _exchanges(
     listed: Mapping[str, Sequence[float]],
-    one: Values,
-    allowed: Callable[[Iterable[Values]], list[Values]],
+    z: Values,
+    allowed: Callable[[list[Values]], list[Values]],
 ) -> list[Values]:
-    """Those of one list that keep the constraints; else those of two."""
-    moves = [(name, value) for name in one for value in _beside(listed[name], one[name])]
-    pairs = ((a, b) for a, b in combinations(moves, 2) if a[0] != b[0])
-    return allowed(one | {name: value} for name, value in moves) or allowed(
-        one | dict(pair) for pair in pairs
-    )
+    """Those of one list that keep the constraints; where there are none, those of two."""
+    moves = [(name, value) for name in z for value in _beside(listed[name], z[name])]
+    single = allowed([z | {name: value} for name, value in moves])
+    return single or allowed([z | dict(two) for two in combinations(moves, 2)
+                              if two[0][0] != two[1][0]])  # fmt: skip
 
 
 def _beside(values: Sequence[float], value: float) -> list[float]:

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import (
+from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
+from ccd_casadi.codesign.outer_problem import (
     FormulationResult,
     FormulationRound,
     KnownSamples,
-    iterate_of,
-)
-from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
-from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
+    iterate_of,
     lifted_bounds,
     outer_program,
     solve_program,

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import (
+from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.outer_problem import (
     FormulationResult,
     FormulationRound,
     KnownSamples,
-    iterate_of,
-)
-from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
-from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
+    iterate_of,
     outer_program,
     solve_program,
 )

@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
-from ccd_casadi.codesign.outer_problem import distinct
+from ccd_casadi.codesign.outer_problem import FormulationResult, KnownSamples, distinct
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of

@@ -16,11 +16,10 @@ from ccd_casadi.codesign.final_judgement import (
     second_on_weighted,
     survived,
 )
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
-from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.outer_problem import FormulationResult, lifted_bounds
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign

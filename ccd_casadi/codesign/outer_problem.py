@@ -5,23 +5,33 @@
 `nested` puts the surrogate ω_b*(θ) for ω_b; `lifted` has ω_S and ω_T as variables too, with
 ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low and ‖GS‖∞ <= compliance_max as explicit constraints on
 surrogates; `direct` has no programme: it is local solves on the truth.
+
+What such a formulation leaves behind is here too: iterates, surrogate, and the design it ends with.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from time import perf_counter
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
+from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
+from ccd_casadi.inner_problem.objective import (
+    constraint_shares,
+    constraint_sizes,
+    objective,
+    violated,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import SweepOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.sampling.inner_samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import interrupts_kept, raise_dropped
-from surrogates import design
+from surrogates import GaussianProcess, design
 
 IPOPT: dict[str, Any] = {
     "print_time": False,
@@ -181,11 +191,11 @@ def distinct(
     """Ends (J, x) of local solves from this many starts; those closer than `apart` (shares of the
     box) are one optimum."""
     optima: list[OuterOptimum] = []
-    for objective, x in sorted(ends, key=lambda item: item[0]):
+    for J, x in sorted(ends, key=lambda item: item[0]):
         near = (i for i, other in enumerate(optima) if bounds.away(x, other.x) < apart)
         same = next(near, None)
         if same is None:
-            optima.append(OuterOptimum(x, objective))
+            optima.append(OuterOptimum(x, J))
         else:
             optima[same] = replace(optima[same], starts=optima[same].starts + 1)
     return OuterSolution(tuple(optima), starts)
@@ -231,3 +241,112 @@ def _hardware(problem: CoDesignProblem, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
     """f, and λ in shares of its size."""
     f, lam = plant_of(problem).hardware(theta)
     return f, lam / ca.DM(constraint_sizes(problem)) if lam.numel() else lam
+
+
+@dataclass(frozen=True)
+class FormulationRound:
+    """One round: what the surrogate promised at θ and what the true inner problem gave.
+
+    Attributes
+    ----------
+    theta : tuple of float
+        SI.
+    predicted, truth : float
+        ω_b in rad/s, or another figure in SI; `truth` NaN where θ is infeasible.
+    predicted_objective, objective : float
+        J of both.
+    error : float
+        Relative.
+    step, radius : float
+        From the incumbent, and of the trust region, in shares of the box.
+    """
+
+    theta: tuple[float, ...]
+    predicted: float
+    truth: float
+    predicted_objective: float
+    objective: float
+    error: float
+    step: float
+    radius: float
+
+
+def iterate_of(
+    problem: CoDesignProblem, theta: tuple[float, ...], predicted: float, truth: float,
+    *, error: float, step: float, radius: float = 1.0,
+) -> FormulationRound:  # fmt: skip
+    """A round with J as it was promised and as it is, infinite where there is no true value."""
+    promised, J = (objective(problem, theta, value) for value in (predicted, truth))
+    J = J if np.isfinite(truth) else np.inf
+    return FormulationRound(theta, predicted, truth, promised, J, error, step, radius)
+
+
+@dataclass(frozen=True)
+class FormulationResult:
+    """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
+
+    `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
+    none for direct; `agreed` tells whether prediction and truth met the tolerance at the end.
+    `foreseen`: what they predicted of the run's end before they learnt it, SI (None: they did not).
+    """
+
+    x: Array | None = None
+    iterates: tuple[FormulationRound, ...] = ()
+    surrogates: tuple[GaussianProcess, ...] = ()
+    outer: OuterSolution | None = None
+    agreed: bool = False
+    message: str = ""
+    foreseen: float | None = None
+
+
+def outputs_of(figure: FigureOfMerit) -> dict[str, str]:
+    """What `surrogates` are of, in their order, with units; ln of ratios, and of m/N."""
+    ratios = {"ln_sensitivity_peak": "1", "ln_sensitivity_low": "1"}
+    return {figure.key: figure.si_unit, **ratios, "ln_compliance": "ln(m/N)"}
+
+
+# What a formulation may begin with in place of its own plan: samples at θ, or at (θ, ω_S, ω_T).
+KnownSamples = Sequence[InnerSample | QuantitySample]
+
+
+@dataclass(frozen=True)
+class RunTerms:
+    """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
+    the clock of `perf_counter`."""
+
+    formulation: str
+    tolerance: float
+    seed: int
+    began: float = field(default_factory=perf_counter)
+
+
+@dataclass(frozen=True)
+class GlobalCheck:
+    """What was evaluated: true inner problems at `points` θ, `feasible` of these with a design.
+
+    `fresh`: those that were solved for it; the run had solved the rest on its way.
+    `better`: how many of them beat the J that the formulation came `before` with; `starts` local
+    solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
+    """
+
+    points: int
+    fresh: int
+    feasible: int
+    better: int
+    starts: int
+    seed: int
+    before: float
+    after: float
+    x: Array | None
+
+    @property
+    def moved(self) -> bool:
+        """Whether something better was found."""
+        return self.x is not None
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of result.json."""
+        return {key: value for key, value in vars(self).items() if key != "x"} | {
+            "moved": self.moved
+        }

@@ -7,10 +7,10 @@ from itertools import count
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import Outer, OuterSearch, Place, PolishedDesign, is_expensive
+from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.result_entries import start_entry
 from ccd_casadi.codesign.verified import Solution

@@ -11,6 +11,10 @@ the implicit function theorem gives, for a parameter p of the case,
 
 (Fiacco 1976). ∇²L comes from differences of the true total derivatives. It holds as long as the
 constraints with positive multipliers stay the ones that bind.
+
+A bound p has g = S/p - 1 or g = (p - x)/width, whose ∂∇g/∂p is a multiple of ∇g: it changes dμ/dp
+alone, and is left out of ∂∇L/∂p. Where A alone determines x, ∇²L is not needed. x is in shares of
+the box (z), as are all gradients here.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -85,7 +89,18 @@ class PostOptimal:
 
 @dataclass(frozen=True)
 class _Parameter:
-    """∂∇J/∂p (n, unit box), ∂g/∂p by constraint, and ∂J/∂p and ∂ω_b/∂p at a fixed x."""
+    """A parameter p of the case.
+
+    Attributes
+    ----------
+    name, value : str, float
+    gradient : array (n,)
+        ∂∇J/∂p.
+    levels : mapping
+        ∂g/∂p by constraint.
+    cost, bandwidth : float
+        ∂J/∂p and ∂ω_b/∂p at a fixed x.
+    """
 
     name: str
     value: float
@@ -100,36 +115,39 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
 
     Costs 2n true syntheses for n variables, none where the constraints alone determine x.
     """
-    here, n = TrueDesign(TrueQuantities(problem), x), x.size
-    design, kkt, active = here.design, here.kkt, active_at(here)
-    kinked = not set(_strong(kkt)) <= set(active.labels)
-    if kinked:  # where local peaks are equal, each is a constraint
-        active = active_at(here, other_peaks(problem, x, design, KktOptions.active))
+    at, n = TrueDesign(TrueQuantities(problem), x), x.size
+    design, kkt, active = at.design, at.kkt, active_at(at)
+    # where local peaks of |S| are equal, more of them bind than ‖S‖∞ alone: each is a constraint
+    equal_peaks = not set(_strong(kkt)) <= set(active.labels)
+    if equal_peaks:
+        active = active_at(at, other_peaks(problem, x, design, KktOptions.active))
 
     def hessian() -> Array | None:
-        if kinked:
+        if equal_peaks:
             return None  # the second derivatives of each peak are not known
         with Progress(1, f"{2 * n} second derivatives", quiet=quiet) as progress:
-            found = lagrangian_hessian(here, np.eye(n), kkt.multipliers)
+            found = lagrangian_hessian(at, np.eye(n), kkt.multipliers)
             progress.advance()
         return found
 
     bounds = lifted_bounds(problem)
-    slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * bounds.width
-    moved = {name: [name] for name in problem.inner.bounds}  # peaks besides the largest too
+    to_bandwidth = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * bounds.width
+    moved = {name: [name] for name in problem.inner.bounds}  # the constraints that a bound moves
     moved["S_max"] += [name for name in kkt.multipliers if name.startswith(OTHER_PEAK)]
+    w2 = _Parameter("w2", problem.w2, to_bandwidth, cost=float(design.values[0]))
     own = [_Parameter(name, bound, np.zeros(n), dict.fromkeys(moved[name], -1.0 / bound))
            for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
-    known = _Parameter("w2", problem.w2, slope, cost=float(design.values[0]))
-    return _responses(problem, x, bounds, kkt, active, hessian, [known, *own], slope)
+    return _responses(problem, x, bounds, kkt, active, hessian, [w2, *own], to_bandwidth)
 
 
 def structured_responses(
     problem: CoDesignProblem, sample: InnerSample, found: StructuredValue
 ) -> PostOptimal:
-    """The same over θ alone, with the bounds on the loop by dω_b*/dp = ω_b μ/p.
+    """The same over θ alone, of a controller of fixed structure.
 
-    Of an error or a move time those to the bounds on the loop, and how ω_b moves, are not known.
+    A bound p on the loop moves ω_b* of a fixed θ by dω_b*/dp = ω_b μ/p, μ = d ln ω_b/d ln p being
+    the multiplier of the search, and J by w2 times that. Where the objective is an error or a move
+    time, neither these nor how ω_b moves are known.
 
     How θ and ω_b move is given where the bounds on θ and λ alone determine θ (a vertex); elsewhere
     it takes second derivatives of v(θ), which are not known. At a kink of it the multipliers μ
@@ -137,15 +155,15 @@ def structured_responses(
     """
     bounds = box(problem)
     kkt = theta_kkt(problem, sample, envelope=found.envelope)
-    loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
-    slope, known = np.array(sample.gradient) * bounds.width, problem.figure is BANDWIDTH
-    own = [_Parameter("w2", problem.w2, slope, cost=sample.value)]
-    for name, value, mu in _loop_bounds(problem, loop) if known else ():
-        rate = sample.bandwidth * mu / value
-        own.append(_Parameter(name, value, 0.0 * slope, {}, problem.w2 * rate, rate))
+    mu = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
+    to_value, of_bandwidth = np.array(sample.gradient) * bounds.width, problem.figure is BANDWIDTH
+    parameters = [_Parameter("w2", problem.w2, to_value, cost=sample.value)]
+    for name, value, rate in _loop_bounds(problem, mu) if of_bandwidth else ():
+        change = sample.bandwidth * rate / value
+        parameters.append(_Parameter(name, value, 0.0 * to_value, {}, problem.w2 * change, change))
     return _responses(
         problem, np.array(sample.theta), bounds, kkt, active_theta(problem, sample),
-        lambda: None, own, slope if known else np.nan * slope,
+        lambda: None, parameters, to_value if of_bandwidth else np.nan * to_value,
     )  # fmt: skip
 
 
@@ -160,41 +178,47 @@ def _responses(
     x: Array,
     bounds: Box,
     kkt: KktCertificate,
-    here: ActiveSet,
+    active: ActiveSet,
     hessian: Callable[[], Array | None],
     parameters: Sequence[_Parameter],
-    slope_b: Array,
+    to_bandwidth: Array,
 ) -> PostOptimal:
-    """Responses at x within `bounds`, which begins with θ; ∇²L by `hessian` where directions are
-    left (None: not known), ω_b with `slope_b` (n,); `parameters`: w2 and the bounds on the loop."""
+    """Responses at x within `bounds`, which begins with θ.
+
+    `hessian` gives ∇²L, None where it is not known; it is called where the strong constraints leave
+    directions Z free. `parameters` are w2 and the bounds on the loop; `to_bandwidth` (n,) is ∇ω_b,
+    NaN where it is not known.
+    """
     n, count, width = x.size, len(problem.names), bounds.width
     strong = _strong(kkt)
-    held = [here.labels.index(name) for name in strong]
-    A = here.rows[held] * here.sizes[held, None]
+    held = [active.labels.index(name) for name in strong]
+    A = active.rows[held] * active.sizes[held, None]
     Z = null_space(A)
-    H = hessian() if Z.shape[1] else np.zeros((n, n))
-    determined = H is not None and Z.shape[1] == n - len(A)
+    H = hessian() if Z.shape[1] else np.zeros((n, n))  # 0 where there is no direction for it
+    independent = Z.shape[1] == n - len(A)
+    determined = H is not None and independent
     if H is not None and Z.shape[1]:
         H = 0.5 * (H + H.T)
         determined &= bool(np.linalg.eigvalsh(Z.T @ H @ Z).min() > 0.0)
     system = np.block([[np.zeros((n, n)) if H is None else H, A.T], [A, np.zeros((len(A),) * 2)]])
     to_theta = hardware_slopes(plant_of(problem), x[:count])[0]
-    slope_f = np.pad(to_theta, (0, n - count)) * width  # ω_S and ω_T cost nothing
+    to_hardware = np.pad(to_theta, (0, n - count)) * width  # ω_S and ω_T cost nothing
     responses = []
-    for parameter in _parameters(problem, x, bounds, slope_f, parameters):
+    for parameter in _parameters(problem, x, bounds, to_hardware, parameters):
         dz = np.full(n, np.nan)
         if determined:
             level = [parameter.levels.get(name, 0.0) for name in strong]
             dz = np.linalg.solve(system, -np.concatenate([parameter.gradient, level]))[:n]
         dx = tuple(map(float, dz * width))
         change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
+        by_move = to_bandwidth @ dz if dz.any() else 0.0  # also where ∇ω_b is not known
         responses.append(
             OptimumResponse(
                 parameter=parameter.name,
                 value=parameter.value,
                 objective=float(parameter.cost + change),
-                bandwidth=float(parameter.bandwidth + (slope_b @ dz if dz.any() else 0.0)),
-                hardware_cost=float(slope_f @ dz),
+                bandwidth=float(parameter.bandwidth + by_move),
+                hardware_cost=float(to_hardware @ dz),
                 theta=dx[:count],
                 ln_omega=dx[count:],
             )
@@ -204,12 +228,12 @@ def _responses(
 
 
 def _parameters(
-    problem: CoDesignProblem, x: Array, bounds: Box, slope_f: Array,
+    problem: CoDesignProblem, x: Array, bounds: Box, to_hardware: Array,
     parameters: Sequence[_Parameter],
 ) -> Iterator[_Parameter]:  # fmt: skip
     """w1, `parameters` (w2, bounds on the loop), the level of each λ, and the bounds of x."""
     none, count, plant = np.zeros(x.size), len(problem.names), plant_of(problem)
-    yield _Parameter("w1", problem.w1, slope_f, cost=hardware_cost(plant, x[:count]))
+    yield _Parameter("w1", problem.w1, to_hardware, cost=hardware_cost(plant, x[:count]))
     yield from parameters
     for name in plant.constraint_names:
         yield _Parameter(f"{name} <= 0", 0.0, none, {name: -1.0})
@@ -218,8 +242,8 @@ def _parameters(
         for end, bound, sign in zip(("lower", "upper"), ends, (1.0, -1.0), strict=True):
             value = float(bound if i < count else np.exp(bound))
             unit = 1.0 if i < count else value  # d ln ω = dω/ω
-            slope = sign / (unit * (ends[1] - ends[0]))
-            yield _Parameter(f"{name} {end}", value, none, {f"{name} {end}": slope})
+            level = sign / (unit * (ends[1] - ends[0]))
+            yield _Parameter(f"{name} {end}", value, none, {f"{name} {end}": level})
 
 
 def _loop_bounds(

@@ -16,9 +16,13 @@ import numpy as np
 
 from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
-from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.outer_problem import (
+    FormulationResult,
+    GlobalCheck,
+    OuterSolution,
+    RunTerms,
+)
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.requirements import requirements
 from ccd_casadi.codesign.result_entries import budget_entry, iso_entry, move_entry

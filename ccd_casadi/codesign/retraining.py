@@ -13,10 +13,16 @@ import numpy as np
 from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, RunTerms, outputs_of
 from ccd_casadi.codesign.formulations import Direct, formulation_of
 from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
+from ccd_casadi.codesign.outer_problem import (
+    FormulationResult,
+    KnownSamples,
+    RunTerms,
+    lifted_bounds,
+    outputs_of,
+    unmet_constraint,
+)
 from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
@@ -27,8 +33,8 @@ from ccd_casadi.sampling.inner_samples import (
     quantity_sample,
     spent_entry,
 )
-from ccd_casadi.sampling.sample_keys import hashes_of, problem_hash
 from ccd_casadi.sampling.store import Sample, SampleStore
+from ccd_casadi.sampling.units import hashes_of, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, sobol

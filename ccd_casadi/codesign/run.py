@@ -9,7 +9,6 @@ from time import perf_counter
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.controller_tables import OuterTable
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.formulations import (
     Formulation,
     formulation_of,
@@ -18,7 +17,7 @@ from ccd_casadi.codesign.formulations import (
 )
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
-from ccd_casadi.codesign.outer_problem import unmet_constraint
+from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms, unmet_constraint
 from ccd_casadi.codesign.outer_search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.result import infeasible_dict, of_budget
 from ccd_casadi.codesign.verified import Solution, Verified

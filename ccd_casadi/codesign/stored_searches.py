@@ -28,9 +28,9 @@ from ccd_casadi.inner_problem.structured_search import (
     with_range,
 )
 from ccd_casadi.sampling.inner_samples import InnerSample
-from ccd_casadi.sampling.sample_keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.structured_units import from_controller
+from ccd_casadi.sampling.units import problem_hash, sample_key
 from ccd_casadi.support.terminal import Tell, remark
 
 

@@ -273,7 +273,7 @@ def box_findings(
         "worst_excess": excess,
         "proof": proof.outcome.name.lower(),
         "proven": proof.levels,
-        "unproven": proof.unasked,
+        "unproven": proof.unproven,
         "looseness": BoxCheckOptions.looseness,
     }
     fresh = () if drawn is None else (Reason.DRAWN(words=drawn.words, **drawn.entry),)
@@ -290,7 +290,7 @@ def box_findings(
     elif drawn is not None and drawn.survived < drawn.draws:
         found = (*fresh, *found)
     elif along:
-        own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
+        own = OwnSet.SEARCHED if proof.unproven else OwnSet.KEPT
         own = OwnSet.UNPROVEN if proof.unclosed else own
         found = (Reason.SET_WITHIN(), *proven, Reason.JUDGED_ON(), worst_found, *fresh)
     else:

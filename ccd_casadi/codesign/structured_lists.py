@@ -14,10 +14,10 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import ThetaDescentOptions, pieces_from
 from ccd_casadi.codesign.outer_problem import (
+    FormulationResult,
     NonlinearProgram,
     OuterFailure,
     solve_program,

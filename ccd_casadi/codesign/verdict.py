@@ -16,7 +16,7 @@ from enum import StrEnum
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
-from ccd_casadi.codesign.formulation import GlobalCheck
+from ccd_casadi.codesign.outer_problem import GlobalCheck
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.survival import STATED, Survival, SurvivalOptions
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from ccd_casadi.codesign.final_judgement import OtherDamping, judge_on_model
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
+from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck, outputs_of
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import controller_dict
 from ccd_casadi.codesign.survival import Survival

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
+from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.structured_entries import (
     active_of,

@@ -118,21 +118,7 @@ def rounding_bound(
     held: StateSpace, K: StateSpace, fixed: FixedPoint,
     options: ResponseSumOptions = ResponseSumOptions(),
 ) -> RoundingBound:  # fmt: skip
-    """Bound what the integers move the sensors on one plant.
-
-    Parameters
-    ----------
-    held : StateSpace
-        Plant behind hold and delay.
-    K : StateSpace
-        Of the integers, SI.
-    fixed : FixedPoint
-    options : ResponseSumOptions
-
-    Returns
-    -------
-    RoundingBound
-    """
+    """Bound what the integers move the sensors on one plant."""
     loop = closed_loop(held, K)
     n, k = len(held.A), len(K.A)
     states, count = fixed.states, 2.0**-fixed.guard
@@ -176,16 +162,7 @@ def _summed(A: Array, B: Array, C: Array, options: ResponseSumOptions) -> Array:
 
 
 def rounding_finding(found: RoundingBound) -> Finding:
-    """What integers add.
-
-    Parameters
-    ----------
-    found : RoundingBound
-
-    Returns
-    -------
-    Finding
-    """
+    """What integers add."""
     why = Reason.ROUNDING if isfinite(found.largest) else Reason.ROUNDING_UNKNOWN
     return why(bits=found.bits, largest=found.largest)
 

@@ -261,7 +261,7 @@ def deploy(
     if designed is not None:
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
-        way |= {"needed_hz": own_hz, "target": target, "designed": designed}
+        way |= {"needed_hz": own_hz, "target": target, "designed_for": designed}
         found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, code, way)
         return replace(found, judge=attempted(_judged, run, found))
     loops = list(zip(channels, small, strict=True))

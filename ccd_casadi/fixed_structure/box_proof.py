@@ -1,4 +1,13 @@
-"""A proof that a controller keeps its bounds on a whole box of plants, by branch and bound."""
+"""A proof that a controller keeps its bounds on a whole box of plants, by branch and bound.
+
+A box is a range of frequency times one of each uncertain parameter. `LoopFamily.enclose` has, for
+every box and every bound, lower <= figure/bound <= upper on all of the box. Boxes are halved, those
+with the largest `upper` first, until
+
+    upper <= 1 + slack on every box and bound    proven, and all loops are stable as one is
+    lower > 1 + slack on one box                 refuted: every plant of it exceeds the bound
+    the number of boxes is spent                 every figure is proven below its largest `upper`
+"""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -70,12 +79,12 @@ class BoxProofOptions:
 class Division:
     """What a number of `boxes` prove: figures over bounds at most, by kind of bound.
 
-    `passed`: a bound, by which factor it is passed at least on some box, and that one's middle.
+    `exceeded`: a bound, the least factor by which a box exceeds it, and the middle of that box.
     """
 
     levels: dict[str, float]
     boxes: int
-    passed: tuple[str, float, tuple[float, ...]] | None = None
+    exceeded: tuple[str, float, tuple[float, ...]] | None = None
 
 
 @dataclass(frozen=True)
@@ -93,12 +102,12 @@ class _Enclosed(Boxes):
         return dict(zip(names, self.highest.max(axis=1, initial=0.0).tolist(), strict=True))
 
 
-def divided(
-    family: LoopFamily, box: Array, slack: float, share: int, enough: int,
+def divide_one(
+    family: LoopFamily, box: Array, slack: float, most: int, enough: int,
     options: BoxProofOptions = BoxProofOptions(),
 ) -> Division:  # fmt: skip
-    """Up to `share` boxes of the whole one (2, n); `enough` where too many of them stay open."""
-    part, known, spent = _first(family, box, options.decades), np.array(np.inf), 0
+    """Divide the box (2, n) of one option into up to `most`; `enough` where too many stay open."""
+    part, known, spent = _initial_boxes(family, box, options.decades), np.array(np.inf), 0
     levels: dict[str, float] = {}
     waiting: _Enclosed | None = None
     while True:
@@ -109,15 +118,15 @@ def divided(
         if found.lowest[k, j] > 1.0 + slack:
             middle = tuple((0.5 * (part.low + part.high)[1:, j]).tolist())
             return Division({}, spent, (found.names[k], float(found.lowest[k, j]), middle))
-        highest = np.minimum(found.highest, known)
+        highest = np.minimum(found.highest, known)  # what holds on a box holds on its halves
         here = _Enclosed(part.chart, part.low, part.high, highest, found.spread)
-        wide = here.worst > 1.0 + slack
-        levels = raised(levels, here.only(~wide).levels(found.names))
-        here = here.only(wide)
+        is_open = here.worst > 1.0 + slack
+        levels = raised(levels, here.only(~is_open).levels(found.names))
+        here = here.only(is_open)
         waiting = here if waiting is None else waiting.beside(here)
         count = len(waiting.worst)
         stuck = spent >= enough and count > options.stuck_share * spent
-        if not count or spent >= share or stuck:
+        if not count or spent >= most or stuck:
             return Division(raised(levels, waiting.levels(found.names)), spent)
         order = np.argsort(-waiting.worst, kind="stable")
         first = min(options.batch, max(enough // options.batches, count // 4, 1))
@@ -131,8 +140,12 @@ def raised(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str
     return {name: max(levels.get(name, 0.0), others.get(name, 0.0)) for name in names}
 
 
-def _first(family: LoopFamily, box: Array, decades: float) -> Boxes:
-    """Cells of frequency from 0 to infinity, or to half the sampling rate, over the whole box."""
+def _initial_boxes(family: LoopFamily, box: Array, decades: float) -> Boxes:
+    """Cells of frequency from 0 to infinity, or to half the sampling rate, over the whole box.
+
+    Their coordinate is ω/unit up to 1 and then unit/ω down to 0, or ωT from 0 to π; one more cell
+    is ω_low alone. ω_low, ω_b and the end of the shape are edges: no bound ends inside a cell.
+    """
     low, band = family.bounds.omega_low / family.unit, family.bandwidth / family.unit
     scale, top = 1.0, 1.0
     if family.period is not None:
@@ -149,7 +162,7 @@ def _first(family: LoopFamily, box: Array, decades: float) -> Boxes:
     cells.append((Chart.POINT, low * scale, low * scale))
     pieces = [np.array([[low], [high]]).T for low, high in box.T]
     for i, (low, high) in enumerate(box.T.tolist()):
-        if 0.0 < 2.0 * low < high:  # a factor: its lowest values are found in pieces only
+        if 0.0 < 2.0 * low < high:  # a factor begins in octaves: a disc over more holds too much
             ends = np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
             pieces[i] = np.stack([ends[:-1], ends[1:]], axis=1)
     every = [*itertools.product(cells, *pieces)]
@@ -159,7 +172,11 @@ def _first(family: LoopFamily, box: Array, decades: float) -> Boxes:
 
 
 def _halved(boxes: _Enclosed) -> Boxes:
-    """Each box halved along the coordinate that moves its loop most."""
+    """Each box halved along the coordinate that moves its loop most.
+
+    Not along one whose ends differ by rounding alone; a range over more than a factor of 4 at its
+    geometric mean, and one of frequency from 0 at a tenth of its end.
+    """
     width = boxes.high - boxes.low
     size = np.maximum(np.abs(boxes.low), np.abs(boxes.high))
     fine = width > 1e-13 * np.maximum(size, 1e-300)
@@ -169,7 +186,7 @@ def _halved(boxes: _Enclosed) -> Boxes:
     a, b = boxes.low[along, rows], boxes.high[along, rows]
     middle = 0.5 * (a + b)
     wide = ((along == 0) | (a > 0.0)) & (b > 4.0 * a)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # √(ab) of a parameter from below 0 is not chosen
         middle = np.where(wide, np.where(a > 0.0, np.sqrt(a * b), 0.1 * b), middle)
     left, right = boxes.high.copy(), boxes.low.copy()
     left[along, rows] = right[along, rows] = middle
@@ -221,8 +238,8 @@ class Proof:
     boxes : int
         Boxes that were enclosed.
     option, point, passed : int, tuple of float, (str, float)
-        Of a refuted box: where, which bound and the least factor by which it is exceeded there, by
-        an enclosure and not by a sample.
+        Of a refuted box: where, the bound that it passes there (exceeds) and the least factor by
+        which, by an enclosure and not by a sample.
     left : str
         Which bounds the proof is not of, in words; empty: of every bound.
     """
@@ -263,7 +280,7 @@ class Proof:
         return self.outcome not in NOT_APPLICABLE
 
     @property
-    def unasked(self) -> str:
+    def unproven(self) -> str:
         """Why the proof does not apply, or is not of every bound; empty where it is of all."""
         return self.left if self.applies else self.outcome.value
 
@@ -293,7 +310,7 @@ class Proof:
             return (f"the proof denies it: {self.outcome.value}",)
         if not self.stable:
             return (f"searched, not proven: {self.outcome.value}",)
-        left = (self.left,) if self.left else ()
+        left = (self.unproven,) if self.left else ()
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
             over = [
@@ -358,41 +375,54 @@ def prove(
     names = uncertain.names
     several = isinstance(structure, ChannelStructure) and bounds.error is None
     many = several or len(names) > options.few_parameters
-    slack = slack or (options.slack_of_many if many else options.slack)
+    if slack is None:
+        slack = options.slack_of_many if many else options.slack
+    families = _families(uncertain, structure, kappa, bandwidth, bounds, sampling, options)
+    if isinstance(families, ProofOutcome):
+        return Proof(families, slack, names)
+    most, enough = (most_boxes or options.most_boxes) // len(families), None
+    if many and most_boxes is None:
+        most, enough = min(most, options.most_boxes_of_many), options.stuck_boxes_of_many
+    proof = divide(families, uncertain.box, slack, most, workers, enough, options)
+    # where sensors share an actuator every place is enclosed
+    single = bounds.error is None and any(c.given for c in bounds.channels)
+    return replace(proof, left="bounds of single channels are judged, not proven" if single else "")
+
+
+def _families(
+    uncertain: UncertainPlant, structure: Structure | ChannelStructure, kappa: Array,
+    bandwidth: float, bounds: Bounds, sampling: Sampling | None, options: BoxProofOptions,
+) -> list[LoopFamily] | ProofOutcome:  # fmt: skip
+    """The loops of every option, or why there is no proof of them."""
     outputs, inputs = structure.directions
     if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
-        return Proof(ProofOutcome.NOT_SQUARE, slack, names)
+        return ProofOutcome.NOT_SQUARE
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
     K = structure.state_space(kappa)
     if not all(Loop(model, K, sampling).stable for model in models):
-        return Proof(ProofOutcome.UNSTABLE, slack, names)
+        return ProofOutcome.UNSTABLE
     fastest = max(float(np.abs(model.rates).max()) for model in models)
     unit = options.unit_frequency * max(bandwidth, fastest, bounds.omega_low)
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
-    families, family = [], LoopFamily if bounds.error is None else SensorFamily
-    for option in range(len(models)):
-        low_pass = _low_pass(uncertain.options[option], sampling, options.poles_apart)
+    kind = LoopFamily if bounds.error is None else SensorFamily
+    families = []
+    for option, system in enumerate(uncertain.options):
+        low_pass = _low_pass(system, sampling, options.poles_apart)
         if low_pass is None:
-            return Proof(ProofOutcome.WIRED, slack, names)
+            return ProofOutcome.WIRED
         plant = modal_sum(uncertain, option, unit)
+        if plant is None and system.first_order:
+            return ProofOutcome.FIRST_ORDER
         if plant is None:
-            why = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
-            why = ProofOutcome.FIRST_ORDER if uncertain.options[option].first_order else why
-            return Proof(why, slack, names)
-        families.append(family(
-            plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay,
+            return ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
+        families.append(kind(
+            plant, uncertain.names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay,
             tuple((low_pass / unit).tolist()),
         ))  # fmt: skip
-    share, enough = (most_boxes or options.most_boxes) // len(models), None
-    if many and most_boxes is None:
-        share, enough = min(share, options.most_boxes_of_many), options.stuck_boxes_of_many
-    proof = divide(families, uncertain.box, slack, share, workers, enough, options)
-    # where sensors share an actuator every place is enclosed
-    single = bounds.error is None and any(c.given for c in bounds.channels)
-    return replace(proof, left="bounds of single channels are judged, not proven" if single else "")
+    return families
 
 
 def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.ndarray | None:
@@ -405,7 +435,7 @@ def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.
 
 
 def divide(
-    families: list[LoopFamily], box: Array, slack: float, share: int, workers: Pool | None = None,
+    families: list[LoopFamily], box: Array, slack: float, most: int, workers: Pool | None = None,
     enough: int | None = None, options: BoxProofOptions = BoxProofOptions(),
 ) -> Proof:  # fmt: skip
     """Prove bounds on a box by branch and bound over every option's loops.
@@ -418,32 +448,31 @@ def divide(
         Ends of the uncertain parameters.
     slack : float
         Relative; by how much a bound may be exceeded in what is proven.
-    share : int
+    most : int
         Boxes of each option, at most.
     workers : Pool or None
     enough : int or None
-        Boxes after which a proof without a prospect ends.
+        Boxes after which a proof ends that has too many of them open (`stuck_share`); None: `most`.
     options : BoxProofOptions
 
     Returns
     -------
     Proof
     """
-    enough = share if enough is None else enough
-    first = sorted(range(len(families)), key=lambda option: -len(families[option].plant.omega))
-    tasks = {option: (families[option], box, slack, share, enough, options) for option in first}
-    found = dict(results(workers, divided, tasks))
+    enough = most if enough is None else enough
+    longest_first = sorted(range(len(families)), key=lambda i: -len(families[i].plant.omega))
+    tasks = {i: (families[i], box, slack, most, enough, options) for i in longest_first}
+    found = dict(results(workers, divide_one, tasks))
     names, levels = families[0].names, dict[str, float]()
     for option in range(len(families)):
-        if (passed := found[option].passed) is not None:
-            name, factor, point = passed
-            return Proof(ProofOutcome.REFUTED, slack, names, {}, found[option].boxes, option, point,
+        one = found[option]
+        if one.exceeded is not None:
+            name, factor, point = one.exceeded
+            return Proof(ProofOutcome.REFUTED, slack, names, {}, one.boxes, option, point,
                          (name, factor))  # fmt: skip
-        levels = raised(levels, found[option].levels)
+        levels = raised(levels, one.levels)
     highest = max(levels.values(), default=0.0)
-    outcome = ProofOutcome.PROVEN
+    outcome = ProofOutcome.PROVEN if highest <= 1.0 + slack else ProofOutcome.LOOSER
     if not np.isfinite(highest):
         outcome = ProofOutcome.OPEN
-    elif highest > 1.0 + slack:
-        outcome = ProofOutcome.LOOSER
     return Proof(outcome, slack, names, levels, sum(one.boxes for one in found.values()))

@@ -28,7 +28,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     search_from_starts,
 )
 from ccd_casadi.fixed_structure.plant_set import plant_set
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, redraw_section, stabilising
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
@@ -361,7 +361,7 @@ def _reworked(
         count = max(search.starts // 2, 1)
         moved = stabilising(problem, reinserted(problem, fresh))[:count]
         more, like = count - len(moved), [end.kappa for end in ends]
-        drawn = stabilising(problem, redrawn(problem, like, options.pool // 2 * more, rng))
+        drawn = stabilising(problem, redraw_section(problem, like, options.pool // 2 * more, rng))
         pool = np.concatenate([moved, _nearest(problem, drawn, more, workers, options.batch)])
         runners = search_from_starts(problem, pool, search.tell, workers, runners, known=len(moved),
                            options=options.multi_start)  # fmt: skip

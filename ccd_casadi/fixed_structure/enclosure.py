@@ -6,10 +6,11 @@ with their number and not with that of the boxes' corners. With K = K̂/y and W 
 
     S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
-`LoopFamily.enclose` has the chain of inequalities from the discs to the figures. y is that of
-`boxes`. Free bodies are infinite at 0 Hz, and far above all else beside it: up to ω_low what
-`_at_rest` finds holds, too. Where M is regular on the whole axis for all of a connected set of
-plants, no pole crosses it: they are all stable or none is (zero exclusion).
+`LoopFamily.enclose` has the chain of inequalities from the discs to the figures. y is s over `unit`
+(sampled and in the upper chart as `boxes` has it), or 1 where no channel has an integrator, so that
+K̂ = yK is finite at 0 Hz. Free bodies are infinite there, and far above all else beside it: up to
+ω_low what `_at_rest` finds holds, too. Where M is regular on the whole axis for all of a connected
+set of plants, no pole crosses it: they are all stable or none is (zero exclusion).
 """
 
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ class LoopDiscs:
         KW, rounding = self.K @ self.W, GUARD * norm(self.K) * self.w
         k = self.terms.largest(KW, KW, self.unit) + rounding
         k1 = k * (1.0 + self.a1 * (self.delta_GK + self.delta_y))
-        v = self.epsilon * self.a2 * (norm(self.K) + k1 * (self.y_max + self.delta_GK))
+        v = self.epsilon * self.a2 * (norm(self.K) + k1 * self.y_max)
         least = norm(KW) - rounding - k * self.d - k1 + k - v
         lower = (1.0 - self.epsilon) * least - self.grain * self.a2
         upper = (1.0 + self.epsilon) * (k1 + v) + self.grain * self.a2
@@ -194,25 +195,27 @@ class LoopDiscs:
         return FigureBounds(upper, least / (1.0 + self.q), by_disc, (moved + self.q) * h)
 
     def spread(self, worst: np.ndarray, figures: dict[str, FigureBounds]) -> Array:
-        """How much each coordinate moves the loop (1 + n_p, N): along what moves M, of several
-        outputs the figure `worst` (N,) that is furthest above its bound."""
+        """How much each coordinate moves the loop (1 + n_p, N), from what each moves the discs.
+
+        A disc counts by how far it moves M; with several `figures` by how far it moves the one that
+        is furthest above its bound, `worst` (N,). It decides what is divided: no bound rests on it.
+        """
         n, rows = len(self.c), self.terms.rows
-        weight = _lengths(self.c) * _lengths(self.b @ self.K)
-        own = self.r * np.abs(np.einsum("Nip,ip->Ni", rows, self.c))  # near 1 it moves 1/M less
-        weight = weight * np.where(own < 1.0, (1.0 - own) / (1.0 + own), 1.0)
-        weight = np.where(np.tile(self.finite.T, 2), np.tile(weight, 2), 1.0)
-        weight[:, n:] = 0.0
+        by_disc = np.zeros((len(self.w), 2 * n))  # of `held`, then of `free`
+        # |δ_i q_iᵀc_i| near 1 lets M nearly vanish: a smaller radius moves 1/M by less than that
+        own = self.r * np.abs(np.einsum("Nip,ip->Ni", rows, self.c))
+        moves = _lengths(self.c) * _lengths(self.b @ self.K)
+        moves = moves * np.where(own < 1.0, (1.0 - own) / (1.0 + own), 1.0)
+        by_disc[:, :n] = np.where(self.finite.T, moves, 1.0)
         rest = self.delta_y + self.y_max * self.epsilon
         for name, figure in figures.items():
             here = self.good & (worst == name)
-            weight[here, : figure.by_disc.shape[1]] = figure.by_disc[here]
+            by_disc[here, : figure.by_disc.shape[1]] = figure.by_disc[here]
             rest[here] = np.where(np.isfinite(figure.beside), figure.beside, 0.0)[here]
-        found = np.zeros_like(self.held.shares[0])
-        for by, discs in ((weight[:, :n], self.held), (weight[:, n:], self.free)):
-            shares = np.where(np.isfinite(discs.shares), discs.shares, 0.0)
-            found += np.einsum("Ni,ikN->kN", by, shares)
+        shares = np.concatenate([self.held.shares, self.free.shares])
+        found = np.einsum("Ni,ikN->kN", by_disc, np.where(np.isfinite(shares), shares, 0.0))
         found[0] += rest
-        return found
+        return np.asarray(found)
 
 
 @dataclass(frozen=True)
@@ -275,13 +278,14 @@ class LoopFamily:
             (10)  ‖M_d⁻¹ - W‖ <= ad,   d = Σ r_i |c_i| |b_iᵀK_c W|
 
         by (4) a Neumann series, (6) S₁ - S_d = M₁⁻¹(Δ_y T_d - Δ_GK S_d), (8) M₂⁻¹ =
-        (1 + T₁E)⁻¹M₁⁻¹, (9) S₁ - S₂ = T₁E S₂, (10) M_d⁻¹ - W = M_d⁻¹(M_c - M_d)W. The figures:
+        (1 + T₁E)⁻¹M₁⁻¹, (9) S₁ - S₂ = T₁E S₂, (10) M_d⁻¹ - W = M_d⁻¹(M_c - M_d)W with M_c = W⁻¹;
+        M₂ = M₁(1 + T₁E) as M₁T₁ = G(K_c + F) and FE = 0. The figures:
 
             (11)  |y_c| w - |y_c| ad - u₂ <= ‖S₂‖ <= min(|y_c| a + u₂, max|y| a₂)
             (12)  ‖1 - y_c W‖ - |y_c| ad - u₂ <= ‖T₂‖ <= t + u₂
             (13)  ‖K_c M_d⁻¹‖ <= k                                    `RankOneDiscs.largest`
             (14)  ‖K_c M₁⁻¹‖ <= k₁ = k(1 + a₁δ)
-            (15)  ‖K_c T₁E M₂⁻¹‖ <= v = ε a₂(‖K_c‖ + k₁(max|y| + δ_GK))
+            (15)  ‖K_c T₁E M₂⁻¹‖ <= v = ε a₂(‖K_c‖ + k₁ max|y|)
             (16)  ‖K̂M₂⁻¹‖ <= (1 + ε)(k₁ + v) + ‖F‖a₂,
                   ‖K̂M₂⁻¹‖ >= (1 - ε)(‖K_c W‖ - kd - (k₁ - k) - v) - ‖F‖a₂
             (17)  ‖M_d⁻¹G‖ <= h,   G in its discs, of radius e_i      `RankOneDiscs.largest`
@@ -289,7 +293,9 @@ class LoopFamily:
             (19)  ‖yM₂⁻¹G‖ >= (|y_c|(‖WG_c‖ - a d_G) - (δ_y + max|y| a₁δ)h)/(1 + q),
                   d_G = Σ e_i |c_i| |b_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
 
-        each lower bound, k and h less or more the rounding of its matrix, `GUARD` times its size.
+        by (15) K_c T₁ = K_c - yK_c M₁⁻¹, (16) M₂⁻¹ = M₁⁻¹ - T₁E M₂⁻¹, (18) yM₂⁻¹G =
+        y(1 + T₁E)⁻¹(1 - M₁⁻¹(Δ_y + Δ_GK))M_d⁻¹G; each lower bound, k and h less or more the
+        rounding of its matrix, `GUARD` times its size.
 
         Parameters
         ----------
@@ -345,11 +351,9 @@ class LoopFamily:
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
         good = finite.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
         y, y_max, delta_y = self._y(axis)
-        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
+        m, r, g, e, K = self._middles(good, held, free, gains)
         c, b = self.plant.reading, self.plant.drive
         rows = b @ K
-        m, r, g, e = (np.where(good, part, 0.0).T
-                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
         unit = np.tile(np.eye(c.shape[1]), (len(good), 1, 1))
         M = y[:, None, None] * unit + (c.T * m[:, None]) @ rows
         good &= np.linalg.det(M) != 0.0
@@ -381,22 +385,27 @@ class LoopFamily:
     def _at_rest(self, boxes: Boxes) -> Enclosures:
         """The same, upper bounds alone, on boxes at rest, of a plant with free bodies.
 
-        G = G_r + F, G_r = R/s². With P the projection on what free bodies do not move, P R = 0, and
-        q = max|y|²/μ, μ the size of y² G_r K̂, N = q(1 - P) + P, so that N G_r = q G_r is finite,
-        M is taken times N, ‖N‖ <= n = max(q, ‖P‖):
+        G = R/s² + G_F with R = Σ c_i b_iᵀ of the free bodies. The discs hold y²/s², which is finite
+        at 0 Hz, in place of 1/s². With P the projection on what free bodies do not move, PR = 0,
+        and μ the size of y²R/s² K_c at the middles, M is taken times
 
-            NM = y N + q G_r K̂ + N F K̂,   M_d = y_c P + (q G_r + P F) K_c on the discs
+            N = (y²/μ)(1 - P) + P,   NG = G_R + N G_F,   G_R = y²R/(μs²),
+            ‖1 - P‖ |y²|/μ <= q = max|y|²/μ,   ‖N‖ <= n = max(q, ‖P‖)
+
+            NM₂ = yN + (G_R + N G_F)K̂,   M_d = y_c P + (G_R + P G_F)K_c on the discs
+            NM₁ = yN + (G_R + N G_F)(K_c + F),   with K̂ = K_c(1 + E) + F as in `enclose`
 
             (1)  W = M_d⁻¹ at the middles,   ‖M_d⁻¹‖ <= a
-            (2)  ‖NM - M_d‖ <= δ = q(max|y| + Σ_F (|m_i| + r_i) |c_i| |b_iᵀK_c|) + ‖P‖δ_y + ...
+            (2)  ‖NM₁ - M_d‖ <= δ = q(max|y| + Σ_F (|m_i| + r_i) |c_i| |b_iᵀK_c|) + ‖P‖δ_y
+                                    + ‖F‖(Σ_R + n Σ_F)(|m_i| + r_i) |c_i| |b_i| + rounding
             (3)  ‖(NM₁)⁻¹‖ <= a₁ = a/(1 - aδ)                         where aδ < 1
             (4)  ‖T₁E‖ <= ε(1 + max|y| n a₁),   T₁ = 1 - y(NM₁)⁻¹N     where that is below 1
             (5)  ‖(NM₂)⁻¹N‖ <= a₂ = n a₁/(1 - ε(1 + max|y| n a₁))
 
-            ‖S‖ <= max|y| a₂,  ‖K̂S/y‖ <= ((1 + ε)‖K_c‖ + ‖F_K‖)a₂,  ‖T‖ <= 1 + ‖S‖,
-            ‖GS‖ <= max|y| a₂/n (‖q G_r‖ + n‖F‖)
+            ‖S‖ <= max|y| a₂,  ‖K̂S/y‖ <= ((1 + ε)‖K_c‖ + ‖F‖)a₂,  ‖T‖ <= 1 + ‖S‖,
+            ‖GS‖ <= max|y| a₂/n (‖G_R‖ + n‖G_F‖)
 
-        with F_K the gains that are bounded only; δ has their part and the rounding, too.
+        Σ_R and Σ_F are sums over the free and the other modes.
         """
         axis = axis_of(boxes, self.period, self.delay, True, self.low_pass)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
@@ -404,9 +413,7 @@ class LoopFamily:
         gains, epsilon, _, grain = self._gains(axis)
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius).all(axis=0)
         good = finite & np.isfinite(gains).all(axis=1) & damped
-        m, r, g, e = (np.where(good, part, 0.0).T
-                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
-        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
+        m, r, g, e, K = self._middles(good, held, free, gains)
         c, b, rigid = self.plant.reading, self.plant.drive, self.plant.rigid
         U, s, _ = np.linalg.svd(c[rigid].T, full_matrices=False)
         U = U[:, s > self.options.rank * s[0]]
@@ -416,7 +423,7 @@ class LoopFamily:
         mu = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
         good &= mu > 0.0
         mu = np.where(good, mu, 1.0)
-        for part in (m, r, g, e):
+        for part in (m, r, g, e):  # from here on those of G_R
             part[:, rigid] /= mu[:, None]
         q = axis.y.size**2 / mu
         n = np.maximum(q, P_norm)
@@ -428,7 +435,8 @@ class LoopFamily:
         W = np.linalg.inv(np.where(good[:, None, None], M, unit))
         sizes = (np.abs(m) + r) * _lengths(c) * _lengths(rows)
         delta = q * (y_max + sizes[:, ~rigid].sum(axis=1)) + P_norm * delta_y  # (2)
-        delta += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
+        driven = (np.abs(m) + r) * _lengths(c) * _lengths(b)
+        delta += grain * (driven[:, rigid].sum(axis=1) + n * driven[:, ~rigid].sum(axis=1))
         total = sizes.sum(axis=1) + P_norm * np.abs(y)
         delta += GUARD * total * (1.0 + total * norm(W))
         ones = np.tile(unit, (len(good), 1, 1))
@@ -470,6 +478,16 @@ class LoopFamily:
         compliance = self.bounds.compliance_max is not None
         return discs_of(self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance)
 
+    def _middles(
+        self, good: np.ndarray, held: Discs, free: Discs, gains: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """m, r, g, e (N, n) and K_c (N, m, p), 0 where a box is not `good`."""
+        m, r, g, e, k = (
+            np.where(good, part, 0.0).T
+            for part in (held.middle, held.radius, free.middle, free.radius, gains.T)
+        )
+        return m, r, g, e, np.einsum("mc,Nc,pc->Nmp", self.inputs, k, self.outputs)
+
     def _y(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array]:
         """y_c, max |y| and δ_y (N,); y is 1 without an integrator."""
         if self._integrator:
@@ -503,7 +521,11 @@ class LoopFamily:
         return np.where(boxes.chart == Chart.POINT, np.inf, 1.0)
 
     def _of_S(self, boxes: Boxes, S: Range, a2: Array) -> list[tuple[str, Array, Array]]:
-        """(name, figure over its bound at most, at least) of every bound on S; ‖S/y‖ <= `a2`."""
+        """(name, figure over its bound at most, at least) of every bound on S; ‖S/y‖ <= `a2`.
+
+        Of the boxes that a bound is not of, as those beyond ω_b of LEVEL, it is infinite. SHAPE is
+        (|S|/ω) / (room(ω/ω_b) √½/ω_b), from ω_low on; its room does not fall with ω.
+        """
         b, inside = self.bounds, self._inside(boxes)
         low, high = boxes.omega(self.unit, self.period)
         point = boxes.chart == Chart.POINT
@@ -530,7 +552,7 @@ class LoopFamily:
     def _weighted(
         self, boxes: Boxes, level: float, KS: Range, T: Range
     ) -> list[tuple[str, Array, Array]]:
-        """The same of KS and T; |W_KS| and |W_T| are monotone in ω."""
+        """The same of KS and T; |W_KS| and |W_T| are monotone in ω: the ends of a box suffice."""
         assert self.bounds.weights is not None
         top = self.options.largest_frequency
         ends = [np.minimum(omega, top) for omega in boxes.omega(self.unit, self.period)]

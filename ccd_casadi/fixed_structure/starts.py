@@ -1,18 +1,18 @@
-"""Where local searches start: loop-shaping rules and random controllers, all of them stable loops.
+"""Where local searches start: loop-shaping rules and random controllers.
 
 A start has its crossover |L(jω_c)| = 1 at a chosen frequency, integrator and lead placed around it
 by the rules of thumb (ω_i = ω_c/6, lead from ω_c/3 to 3ω_c, roll-off at 8ω_c), and its biquads as
-notches at the plants' resonances (`by_rules`) or anywhere (`at_random`). Only those that every
-closed loop of the set is stable with are kept, as eigenvalues say, for hundreds at once.
+notches at the plants' resonances (`by_rules`) or anywhere (`at_random`). `stabilising` keeps those
+with which every closed loop of the set is stable, by eigenvalues, for hundreds at once.
 
 Channels that share a sensor cannot be designed one by one: each alone would take the whole
-bandwidth. There a start is a random controller for each, with a crossover |G_i K_i| = 1 of its own,
-of which those are kept that together hold every plant stable (`actuator_starts`). Where a channel's
+bandwidth. There a start is a random controller for each, with its own crossover |G_i K_i| = 1, of
+which those are kept that together hold every plant stable (`actuator_starts`). Where a channel's
 plant is on its stiffness line at the crossover (a piezo) its lead is turned around into a lag.
 """
 
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -31,20 +31,22 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-# Two biquads at a resonance: (root, over its frequency, damping), first a lag, then a lead.
-SKEWED = (
-    (("zeros", 0.93, 0.07), ("poles", 0.8, 0.1)),
-    (("zeros", 0.95, 0.07), ("poles", 1.1, 0.2)),
-)
+Biquad = tuple[float, float, float, float]  # ω and ζ of its zeros, then ω and ζ of its poles
 
 
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """Make controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
-    Notches come narrow and wide, and shifted to either side; in two more shapes the last biquad is
-    a lead, or lifts |L| at the first anti-resonance, whose dip bounds |S|. Of several biquads two
-    are skewed notches at the first resonance too, which turn its circle away from -1; where the
-    shape ends at ω_b the last one is a filter at the crossover instead.
+    The n biquads of one crossover ω_c are, in turn,
+
+        notches at the resonances, the strongest first, of two widths, and below and above them
+        n > 1, no shape beyond ω_b      wide notches, the last one lifts |L| just below ω_c
+        n > 1, another shape            skewed notches, a lag and a lead, at the first resonance:
+                                        they turn its circle away from -1
+        n > 0                           narrow notches, the last one is a lead of second order, or
+                                        lifts |L| at the first anti-resonance
+
+    |L| is lifted where its dip lets |S| rise to its bound.
 
     Parameters
     ----------
@@ -58,40 +60,37 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
         κ of each.
     """
     tops, count = problem.resonances, problem.structure.biquads
-    plain = [(0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)]
-    narrow = problem.bounds.shape is None or problem.bounds.shape_ends is ShapeEnd.CROSSING
-    skewed = count > 1 and not narrow and len(tops) > 0
+    below_crossover = problem.bounds.shape is None or (
+        problem.bounds.shape_ends is ShapeEnd.CROSSING
+    )
+
+    def notches(crossover: float, width: float, shift: float) -> list[Biquad]:
+        found = []
+        for i in range(count):
+            top = tops[i % len(tops)] if len(tops) else 4.0 * crossover
+            again = i // max(len(tops), 1)  # how often this resonance has a notch already
+            found.append((top * shift ** (1 + again), 0.1, top * shift, width))
+        return found
+
     found, at = [], []
-    for crossover in crossovers:
-        shapes: list[tuple[float, float, tuple[float, ...]]] = [(*one, ()) for one in plain]
-        if count > 1 and narrow:  # |L| just below the crossover, where S rises
-            shapes += [(1.0, 1.0, (ratio * crossover, 1.02, 0.1, 0.07)) for ratio in (0.7, 1.0)]
-        elif skewed:
-            shapes.append((0.5, 1.0, ()))  # the notches beyond the skewed ones
-        if count:  # a lead of second order; the dip of |L| at an anti-resonance, where S rises too
-            shapes.append((0.5, 1.0, (8.0 * crossover, 0.125, 1.0, 0.7)))
-            shapes += [(0.5, 1.0, (dip, 1.0, 0.5, 0.1)) for dip in problem.antiresonances[:1]]
-        for turn, (width, below, lift) in enumerate(shapes):
-            values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)
-            for i in range(count):
-                notch = tops[i % len(tops)] if len(tops) else 4.0 * crossover
-                values[f"biquad {i + 1} zeros"] = notch * below ** (1 + i // max(len(tops), 1))
-                values[f"biquad {i + 1} zeros damping"] = 0.1
-                values[f"biquad {i + 1} poles"] = notch * below
-                values[f"biquad {i + 1} poles damping"] = width
-            if turn == len(plain) and skewed:
-                for i, roots in enumerate(SKEWED, 1):
-                    for root, ratio, damping in roots:
-                        values[f"biquad {i} {root}"] = ratio * tops[0]
-                        values[f"biquad {i} {root} damping"] = damping
-            if lift:
-                poles, ratio, wide, light = lift
-                values[f"biquad {count} zeros"] = ratio * poles
-                values[f"biquad {count} zeros damping"] = wide
-                values[f"biquad {count} poles"] = poles
-                values[f"biquad {count} poles damping"] = light
-            found.append(_kappa(problem, values))
-            at.append(crossover)
+    for crossover in crossovers.tolist():
+        narrow, wide, below, above = (
+            notches(crossover, *each) for each in ((0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25))
+        )
+        sets = [narrow, wide, below, above]
+        if count > 1 and below_crossover:
+            lifts = [ratio * crossover for ratio in (0.7, 1.0)]
+            sets += [[*wide[:-1], (1.02 * lift, 0.1, lift, 0.07)] for lift in lifts]
+        elif count > 1 and len(tops):
+            lag, lead = (0.93, 0.07, 0.8, 0.1), (0.95, 0.07, 1.1, 0.2)
+            skewed = [(zeros * tops[0], thin, poles * tops[0], broad)
+                      for zeros, thin, poles, broad in (lag, lead)]  # fmt: skip
+            sets.append([*skewed, *narrow[2:]])
+        if count:
+            sets.append([*narrow[:-1], (crossover, 1.0, 8.0 * crossover, 0.7)])
+            sets += [[*narrow[:-1], (dip, 0.5, dip, 0.1)] for dip in problem.antiresonances[:1]]
+        found += [_kappa(problem, _pid(problem, crossover), biquads) for biquads in sets]
+        at += [crossover] * len(sets)
     return with_crossover(problem, np.array(found), np.array(at))
 
 
@@ -112,26 +111,28 @@ def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> 
     array (N, n)
         κ of each.
     """
-    tops = problem.resonances
-    known = np.concatenate([tops, problem.antiresonances])
+    places = [(top, True) for top in problem.resonances]
+    places += [(dip, False) for dip in problem.antiresonances]
     found = []
-    for crossover in crossovers:
-        values = _around(problem, float(crossover), rng, 1.0)
-        for i in range(problem.structure.biquads):
-            place = int(rng.integers(len(known))) if len(known) and rng.random() < 0.6 else -1
-            middle = crossover * np.exp(rng.uniform(-0.5, 2.5)) if place < 0 else known[place]
-            near, far = ("zeros", "poles") if place < len(tops) else ("poles", "zeros")
-            values[f"biquad {i + 1} {near}"] = middle * np.exp(rng.normal(0.0, 0.25))
-            values[f"biquad {i + 1} {near} damping"] = np.exp(rng.uniform(np.log(0.02), 0.0))
-            values[f"biquad {i + 1} {far}"] = middle * np.exp(rng.normal(0.1, 0.4))
-            values[f"biquad {i + 1} {far} damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
-        found.append(_kappa(problem, values))
-    kappa = np.reshape(found, (-1, len(problem.structure.names)))  # of no crossover too
+    for crossover in crossovers.tolist():
+        values, biquads = _pid(problem, crossover, rng), []
+        for _ in range(problem.structure.biquads):
+            if places and rng.random() < 0.6:
+                place, zeros_there = places[int(rng.integers(len(places)))]
+            else:
+                place, zeros_there = crossover * np.exp(rng.uniform(-0.5, 2.5)), True
+            there = place * np.exp(rng.normal(0.0, 0.25)), np.exp(rng.uniform(np.log(0.02), 0.0))
+            beside = place * np.exp(rng.normal(0.1, 0.4)), np.exp(rng.uniform(np.log(0.05), 0.0))
+            biquads.append((*there, *beside) if zeros_there else (*beside, *there))
+        found.append(_kappa(problem, values, biquads))
+    kappa = np.reshape(found, (-1, len(problem.structure.names)))  # also where there are none
     return with_crossover(problem, kappa, crossovers)
 
 
-def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.Generator) -> Array:
-    """(N, n) controllers like those at which searches ended, with one section drawn anew.
+def redraw_section(
+    problem: Problem, ends: Sequence[Array], count: int, rng: np.random.Generator
+) -> Array:
+    """Make controllers (N, n) like those at which searches ended, with one section drawn anew.
 
     A section is a biquad, or leads and roll-off together.
     """
@@ -160,11 +161,14 @@ def stabilising(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
     return kappa[np.concatenate(good)] if len(kappa) else kappa
 
 
-def _around(
-    problem: Problem, crossover: float, rng: np.random.Generator, spread: float
+def _pid(
+    problem: Problem, crossover: float, rng: np.random.Generator | None = None
 ) -> dict[str, float]:
+    """PID and roll-off by the rules of thumb; with `rng` each frequency is scattered around."""
+
     def near(factor: float) -> float:
-        return crossover * factor * float(np.exp(spread * rng.normal(0.0, 0.5)))
+        scatter = 1.0 if rng is None else float(np.exp(rng.normal(0.0, 0.5)))
+        return crossover * factor * scatter
 
     values = {"gain": 1.0, "integrator": near(1.0 / 6.0)}
     for i in range(1, problem.structure.lead + 1):
@@ -175,35 +179,42 @@ def _around(
     return values
 
 
-def _kappa(problem: Problem, values: dict[str, float]) -> Array:
+def _kappa(problem: Problem, pid: dict[str, float], biquads: Sequence[Biquad]) -> Array:
+    values, parts = dict(pid), ("zeros", "zeros damping", "poles", "poles damping")
+    for i, biquad in enumerate(biquads, 1):
+        values |= {f"biquad {i} {part}": v for part, v in zip(parts, biquad, strict=True)}
     return np.log(np.array([values[name] for name in problem.structure.names]))
 
 
 def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
-    """κ with the gain that gives |L| = 1 at the crossover of the first plant, boxed."""
+    """Set the gains of κ (N, n) so that |L| = 1 at its crossover on the first plant, in the box."""
     kappa = np.clip(kappa, *problem.box)
     kinds = np.array([kind is ParameterKind.GAIN for kind in problem.structure.kinds])
     v = problem.plants.variable(np.asarray(crossovers, float))
-    kappa[:, kinds] = 0.0
+    kappa[:, kinds] = 0.0  # a gain of 1
     K = problem.structure.response(kappa.T, 1j * v)
     kappa[:, kinds] = -np.log(np.abs(problem.first_response(v) * K))[:, None]
     return np.clip(kappa, *problem.box)
 
 
-def _seen_by(
+def _channel_family(
     structure: ChannelStructure, plant: ScaledPlant, number: int, sampling: Sampling | None
 ) -> PlantSet:
     """The plant of a channel, or of the first that can hold all motions where this one cannot, as
     the difference of two sensors cannot hold a free body; in the unit of the channel's sensor."""
     levels = sensor_levels(plant, structure.decoupling)
-    order = [number, *(i for i in range(len(structure.structures)) if i != number)]
-    for i in order:
+
+    def of_channel(i: int) -> ScaledPlant:
         own = channel_plant(plant, structure.decoupling, i)
-        if i != number:
-            own = replace(own, C=own.C * np.exp(levels[number] - levels[i]))
-        with suppress(PlantError) if i != order[-1] else nullcontext():
+        return replace(own, C=own.C * np.exp(levels[number] - levels[i]))
+
+    others = [i for i in range(len(structure.structures)) if i != number]
+    *earlier, last = [number, *others]
+    for i in earlier:
+        own = of_channel(i)
+        with suppress(PlantError):
             return plant_set([own], sampling)
-    raise AssertionError
+    return plant_set([of_channel(last)], sampling)
 
 
 def actuator_starts(
@@ -227,7 +238,7 @@ def actuator_starts(
     parts = []
     for i in structure.free:
         own = structure.structures[i]
-        family = _seen_by(structure, plants[0], i, sampling)
+        family = _channel_family(structure, plants[0], i, sampling)
         single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
         crossovers = np.exp(rng.uniform(np.log(low), np.log(high), draws))
         kappa = at_random(single, crossovers, rng)
@@ -242,10 +253,8 @@ def actuator_starts(
     every = plant_set(plants, sampling, structure.decoupling)
     found: list[Array] = []
     for kappa in np.hstack(parts):
-        for family in (first, every):
-            if not all_stable(closed_loops(family, structure, kappa)).all():
-                break
-        else:
+        loops = (closed_loops(family, structure, kappa) for family in (first, every))
+        if all(all_stable(each).all() for each in loops):  # the first plant alone refuses most
             found.append(kappa)
         if len(found) == count:
             break

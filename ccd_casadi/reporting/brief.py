@@ -118,17 +118,7 @@ def write_brief(run: FinishedRun, options: BriefOptions = BriefOptions()) -> lis
 
 
 def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
-    """The page as a document of its own, without scripts or requests.
-
-    Parameters
-    ----------
-    run : FinishedRun
-    options : BriefOptions
-
-    Returns
-    -------
-    str
-    """
+    """The page as a document of its own, without scripts or requests."""
     result, problem = run.result, run.problem
     decided = decide(result)
     decision = decided.words or "Not judged."

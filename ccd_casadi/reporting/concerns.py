@@ -112,18 +112,7 @@ def limited_move(result: Mapping[str, Any]) -> str:
 
 
 def limited_move_remedy(result: Mapping[str, Any]) -> str:
-    """What to change where `limited_move` has words.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-
-    Returns
-    -------
-    str
-        A step.
-    """
+    """What to change where `limited_move` has words."""
     if _move(result).get("settles_unlimited", True):
         return "deploy with a larger --saturation, or a slower move"
     return "deploy with a slower move or a wider --window: it does not settle unlimited either"
@@ -202,18 +191,7 @@ def loop_concerns(
 def line_concern(
     result: Mapping[str, Any], options: ConcernOptions = ConcernOptions()
 ) -> list[Concern]:
-    """What |S| of a measured response may reach between its lines; empty where that is little.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    options : ConcernOptions
-
-    Returns
-    -------
-    list of Concern
-    """
+    """What |S| of a measured response may reach between its lines; empty where that is little."""
     reach = result.get("sensitivity_peak_between_lines")
     if reach is None or reach <= max(1.0, options.between_lines * result["sensitivity_peak"]):
         return []
@@ -226,18 +204,7 @@ def line_concern(
 def current_concern(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> list[Concern]:
-    """What a move needs beyond the peak current of its motor; empty where it is enough.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    options : ConcernOptions
-
-    Returns
-    -------
-    list of Concern
-    """
+    """What a move needs beyond the peak current of its motor; empty where it is enough."""
     move = result.get("move") or {}
     share = move.get("needed_share")
     if share is None or not share > 1.0 + options.slack:

@@ -9,14 +9,7 @@ from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.deploy_files import Root, sections_of
 from ccd_casadi.deployment.on_hardware import OnHardware
-from ccd_casadi.deployment.outcome import (
-    ChannelOrders,
-    Deployment,
-    figure_rows,
-    order_words,
-    reason_words,
-    short_status,
-)
+from ccd_casadi.deployment.outcome import ChannelOrders, DeployedRun, Deployment
 from ccd_casadi.deployment.source_code import COMPILE
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
@@ -57,9 +50,10 @@ def deploy_page(
     Page
     """
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
+    deployed = DeployedRun(run, found)
     head = head_of(
         f"Controller of {run_name(run.folder)}, deployed", found.passed,
-        short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
+        deployed.short_status, deployed.reason, meta, _conclusion(run, found),
         run.result,
     )  # fmt: skip
     chapters = [
@@ -88,7 +82,7 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
-    return f"The deployed controller has {order_words(run, found)}.{rest}"
+    return f"The deployed controller has {DeployedRun(run, found).order}.{rest}"
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
@@ -134,7 +128,7 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[c.Block, ...]:
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
-    return c.Facts(tuple(figure_rows(run, found))), *(_words("unstable") if unstable else ())
+    return c.Facts(tuple(DeployedRun(run, found).rows)), *(_words("unstable") if unstable else ())
 
 
 def _step(run: FinishedRun, found: Deployment) -> c.Figure:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationRound
+from ccd_casadi.codesign.outer_problem import FormulationRound
 from ccd_casadi.drawing.content import (
     Band,
     Curve,
@@ -23,8 +23,8 @@ from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import paragraph, theta_axes
-from ccd_casadi.sampling.sample_keys import best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import Sample, SampleStore
+from ccd_casadi.sampling.units import best_key, hashes_of, sample_key
 from ccd_casadi.support.text import HZ, number, small_share, spoken
 from surrogates import GaussianProcess, Quality
 from surrogates.gaussian_process import TWO_SIDED_95

@@ -1,9 +1,12 @@
-"""Results, designs and problems as a notebook shows them: the parts of our pages, one at a time."""
+"""Results, designs and problems as a notebook shows them: the parts of our pages, one at a time,
+and what a run has computed as a table of pandas.
+"""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import singledispatch
 from itertools import count
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
@@ -23,9 +26,16 @@ from ccd_casadi.reporting.facts import conclusion, facts, theta_axes, theta_tabl
 from ccd_casadi.reporting.gain_figures import gains, run_view, view_of
 from ccd_casadi.reporting.limit_figures import controller_blocks
 from ccd_casadi.reporting.run_verdict import run_head
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.units import problem_hash
+from ccd_casadi.support.errors import require
 from ccd_casadi.support.text import HZ, number, template
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+
+if TYPE_CHECKING:
+    import pandas
+
 
 _figures = count()  # ids in an SVG are the whole notebook's
 
@@ -137,3 +147,45 @@ def _design(title: str, figures: DesignFigures, words: str = "") -> tuple[Head |
     if not figures.certified:
         return head, Words(words)
     return head, Facts(tuple(facts("synthesis", figures))), Words(words)
+
+
+_RATES = ("omega_S", "omega_T", "bandwidth", "sensitivity_peak_frequency")  # stored in rad/s
+_LEFT_OUT = ("key", "theta", "gradients")
+
+
+def samples_frame(run: FinishedRun) -> "pandas.DataFrame":
+    """Every true synthesis of a run, one row each: θ in SI under its names, then the figures.
+
+    Frequencies end in `_hz`; a figure is NaN where a synthesis ended before it was known, and
+    `certified` and `reason` say which rows are designs. Of a fixed structure a row is the best
+    design at its θ.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        As `read_run` gives it.
+
+    Returns
+    -------
+    pandas.DataFrame
+
+    Raises
+    ------
+    MissingPackage
+        pandas is not installed.
+    UserError
+        The folder has no usable samples.sqlite.
+    """
+    pandas = require("pandas", "notebook")
+    with SampleStore(run.folder / "samples.sqlite") as store:
+        samples = store.select(problem_hash(run.problem.identity()))
+    rows = []
+    for sample in samples:
+        row = dict(zip(run.problem.names, sample.theta, strict=True))
+        for name, value in asdict(sample).items():
+            if name in _RATES:
+                row[f"{name}_hz"] = value / HZ
+            elif name not in _LEFT_OUT:
+                row[name] = value
+        rows.append(row)
+    return pandas.DataFrame(rows)

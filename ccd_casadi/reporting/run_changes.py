@@ -52,16 +52,7 @@ def write_changes(first: FinishedRun, second: FinishedRun) -> Path:
 
 
 def changes_page(first: FinishedRun, second: FinishedRun) -> c.Page:
-    """The page of what changed.
-
-    Parameters
-    ----------
-    first, second : FinishedRun
-
-    Returns
-    -------
-    Page
-    """
+    """The page of what changed."""
     runs = (first, second)
     names = run_names(first, second)
     views = [replace(run_view(run), label=name) for run, name in zip(runs, names, strict=True)]

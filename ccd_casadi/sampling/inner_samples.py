@@ -249,18 +249,7 @@ def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
 
 
 def unsearched(theta: tuple[float, ...]) -> InnerSample:
-    """What is known at a θ that was not searched, since the time was up.
-
-    Parameters
-    ----------
-    theta : tuple of float
-        SI.
-
-    Returns
-    -------
-    InnerSample
-        Not feasible.
-    """
+    """What is known at a θ that was not searched, since the time was up."""
     nothing = dict.fromkeys(("bandwidth", "gradient", "omega_S", "omega_T", "violation"))
     words = "the time budget ended before this theta was searched"
     own = {"active": [], "shortfall": words, "syntheses": 0}

@@ -24,10 +24,16 @@ from ccd_casadi.sampling.inner_samples import (
     unsearched,
     unsearched_quantities,
 )
-from ccd_casadi.sampling.sample_keys import best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.store import Sample, SampleStore
 from ccd_casadi.sampling.unit_kinds import inner_unit, units_of
-from ccd_casadi.sampling.units import design_unit, timed
+from ccd_casadi.sampling.units import (
+    best_key,
+    design_unit,
+    hashes_of,
+    problem_hash,
+    sample_key,
+    timed,
+)
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress, remark

@@ -11,7 +11,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.result import write_run
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.errors import UserError

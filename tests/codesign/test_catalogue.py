@@ -20,9 +20,9 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.outer_search import search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.result import write_run

@@ -17,7 +17,7 @@ from oracles.helpers import problem
 
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
+from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import result_dict
 from ccd_casadi.codesign.run import outer_of
@@ -188,7 +188,8 @@ def test_bounds_that_are_not_proven_are_not_called_proven() -> None:
     assert proof.unclosed
     assert proof.words.startswith("not every bound is proven")
     assert "1539.8" in proof.words
-    proven = replace(proof, outcome=ProofOutcome.PROVEN, levels={"S_MAX": 1.0005}, channels=True)
+    left = "KS is judged, not proven"
+    proven = replace(proof, outcome=ProofOutcome.PROVEN, levels={"S_MAX": 1.0005}, left=left)
     assert "judged, not proven" in proven.words
 
 

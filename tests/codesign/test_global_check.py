@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from oracles.helpers import problem
 
-from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
+from ccd_casadi.codesign.outer_problem import GlobalCheck
 from ccd_casadi.codesign.outer_search import _starts, global_check
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign import outer_search as search
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.outer import Outer, PolishedDesign
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.result import predicted_value
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.inner_samples import SynthesisCounts

@@ -19,11 +19,10 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.final_judgement import survived
-from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
-from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.outer_problem import GlobalCheck, lifted_bounds
 from ccd_casadi.codesign.reasons import Reason, within_words
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.structured_entries import robust_dict

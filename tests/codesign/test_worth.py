@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ccd_casadi import HZ, Lifted, load_case, problem_of, solve
+from ccd_casadi.extensions.worth import main
 from ccd_casadi.extensions.worth import worth_estimate as worth
-from ccd_casadi.extensions.worth.worth_command import main
 from ccd_casadi.extensions.worth.worth_estimate import outlook, search_error
 from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.inner_problem.objective import objective_of

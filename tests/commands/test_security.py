@@ -66,7 +66,7 @@ def trapped_run(two_mass_run: Path, trap: Path) -> Path:
 
 OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy", "ccd_casadi.robustness",
             "ccd_casadi.retrain", "ccd_casadi.report",
-            "ccd_casadi.extensions.feedforward.feedforward_command"}  # fmt: skip
+            "ccd_casadi.extensions.feedforward"}  # fmt: skip
 NUMBERS = ("imported", "record", "tune")  # take numbers, no case
 COMMANDS = sorted(module for word, (module, _) in commands().items() if word not in NUMBERS)
 

@@ -20,7 +20,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.deploy_files import deployment_dict
-from ccd_casadi.deployment.outcome import Deployment, deployed_line
+from ccd_casadi.deployment.outcome import DeployedRun, Deployment
 from ccd_casadi.deployment.pipeline import _judged, deploy
 from ccd_casadi.deployment.robust_set import as_written, members
 from ccd_casadi.drawing.paint import page_html
@@ -169,8 +169,8 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
         other = replace(run.problem.controller, weighted_level=share * largest)
         of_other = replace(run, problem=replace(run.problem, controller=other))
         again = replace(found, judge=_judged(of_other, found))
-        assert deployed_line(run, again).state == state, again.levels
-        assert any("3.33 times weighted_level" in one.words() for one in again.levels) == (
+        assert DeployedRun(run, again).check().state == state, again.weighted_above
+        assert any("3.33 times weighted_level" in one.words() for one in again.weighted_above) == (
             share < 1.0
         )
     wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))

@@ -20,7 +20,7 @@ from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.deploy_files import controller_dict
 from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
 from ccd_casadi.deployment.on_hardware import forward_of, move, on_hardware
-from ccd_casadi.deployment.outcome import Deployment, deployed_line
+from ccd_casadi.deployment.outcome import DeployedRun, Deployment
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.source_code import COMPILE, write_c
 from ccd_casadi.extensions.formats.code_formats import structured_text
@@ -75,7 +75,7 @@ def test_a_place_that_exceeds_S_max_alone_fails(tmp_path: Path) -> None:
     lower = by_hand(tmp_path, S_max=float(round(0.5 * (others[-1] + top), 3)), harder=1.2)
     failed = deploy(lower, Timing())
     assert not failed.passed
-    assert deployed_line(lower, failed).entry["state"] == "failed"
+    assert DeployedRun(lower, failed).check().entry["state"] == "failed"
     assert failed.judge is not None
     over = [name for name, share in failed.judge.figures.items() if share > 1.0 + 1e-5]
     assert over[-1] == f"S_max of {('motor', 'table', 'actuator')[int(peaks.argmax())]}"

@@ -29,7 +29,7 @@ def test_what_differs_from_the_design_is_the_cause_and_nothing_else(
     rate: float, delay: float, own_rate: float, own_delay: float, known: bool
 ) -> None:
     own = Sampling(own_rate, own_delay)
-    found = short_of(rate, delay, own_rate if known else None, designed=own)
+    found = short_of(rate, delay, own_rate if known else None, designed_for=own)
     words = shortfall_words(found)
     assert ("the delay exceeds" in words) == (delay > own_delay)
     assert ("the rate is below" in words) == (rate < own_rate)
@@ -43,7 +43,7 @@ def test_what_differs_from_the_design_is_the_cause_and_nothing_else(
 @few(max_examples=40)
 @given(rate=RATES, needed=st.none() | RATES)
 def test_a_rate_is_needed_only_where_the_loop_has_less(rate: float, needed: float | None) -> None:
-    found = short_of(rate, 100.0, needed, designed=None, conversion=Conversion.LEAD)
+    found = short_of(rate, 100.0, needed, designed_for=None, conversion=Conversion.LEAD)
     words = shortfall_words(found)
     said = re.search(r"([\d.]+) Hz is needed", words)
     assert (said is not None) == (needed is not None and needed > rate)

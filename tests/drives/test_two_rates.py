@@ -151,5 +151,5 @@ def test_a_design_of_two_rates_keeps_its_bounds_on_every_plant() -> None:
     own = replace(cascade("sinamics_s120"), slower=4)
     found = design_drive(own, uncertain(), bounds(), RATE, options=few)
     assert found.certificate.passed, found.certificate.words
-    assert found.proof.unasked  # of a set there is no proof
+    assert found.proof.unproven  # of a set there is no proof
     assert found.bandwidth > 0.0

@@ -15,10 +15,10 @@ from scipy import signal
 
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.codesign import outer as outer_room
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer import ThetaOuter
+from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.run import OUTERS, solve

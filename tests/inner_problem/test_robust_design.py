@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.sampling.sample_keys import problem_hash
+from ccd_casadi.sampling.units import problem_hash
 from ccd_casadi.solve import main
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities

@@ -25,7 +25,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.sampling.sample_keys import problem_hash
+from ccd_casadi.sampling.units import problem_hash
 
 RUNS = Path(__file__).parents[2] / "runs"
 SECTIONS = '\n[controller]\nstructure = "sections"\n'

@@ -25,9 +25,9 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.extensions.feedforward.feedforward_command import main as feedforward_main
+from ccd_casadi.extensions.feedforward import main as feedforward_main
 from ccd_casadi.extensions.feedforward.move_responses import Shape, responses_of
-from ccd_casadi.extensions.limitations.gap_command import main as gap_main
+from ccd_casadi.extensions.limitations import main as gap_main
 from ccd_casadi.extensions.limitations.limits import discs
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
 from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners

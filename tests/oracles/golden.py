@@ -12,7 +12,7 @@ import ccd_casadi as ccd
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import Uncertainty
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.sampling.sample_keys import problem_hash
+from ccd_casadi.sampling.units import problem_hash
 from oracles.kinds import kinds
 
 ROOT = Path(__file__).parents[2]

@@ -3,9 +3,18 @@
 import os
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from queue import Queue
+from types import SimpleNamespace
 
+from bokeh.document import Document
+from oracles.case_documents import QUICK_SECTIONS
+
+from ccd_casadi.cases.case import load_case
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
+from ccd_casadi.extensions.explorer.page import ExplorerPage
+from ccd_casadi.extensions.explorer.pins import Kept
+from ccd_casadi.extensions.explorer.session import Session
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.worker_process import WorkerLost
 
@@ -45,3 +54,21 @@ def test_the_background_tells_answers_and_outlives_the_death_of_its_process() ->
     assert (first, last) == (3, 2)
     assert (type(failed), type(lost)) == (ZeroDivisionError, WorkerLost)
     assert heard == ["begun", "nearly done"] * 4
+
+
+def test_a_design_that_failed_can_be_started_again(tmp_path: Path) -> None:
+    """The button stayed disabled until a slider moved."""
+    failed: list[Callable[[BaseException], None]] = []
+    background = SimpleNamespace(answer=lambda design, then, otherwise: failed.append(otherwise))
+    (tmp_path / "case.toml").write_text(QUICK_SECTIONS)
+    session = Session(load_case(tmp_path / "case.toml"), tmp_path)
+    page = ExplorerPage(Document(), session, background, (), False, Kept())  # type: ignore[arg-type]
+    before = set(page.document.session_callbacks)
+    page.waits_for(None)  # type: ignore[arg-type]
+    assert page.design.disabled
+    failed[0](ValueError("no such plant"))
+    for made in set(page.document.session_callbacks) - before:
+        made.callback()
+    session.store.close()
+    assert not page.design.disabled
+    assert "no such plant" in page.note.text

@@ -13,7 +13,7 @@ from oracles.helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
+from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.design import SectionsOutcome

@@ -15,9 +15,9 @@ from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import RobustTable
-from ccd_casadi.codesign.formulation import FormulationRound
+from ccd_casadi.codesign.outer_problem import FormulationRound
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.deployment.outcome import against, deployed_line
+from ccd_casadi.deployment.outcome import DeployedRun, against
 from ccd_casadi.deployment.robust_set import MemberLoop
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -313,12 +313,12 @@ def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
     found = SimpleNamespace(
         sampled=model, worst=worst, members=(worst,), rate_hz=1e4, delay=1e-4, needed_hz=1e4,
         realisation=SimpleNamespace(system=SimpleNamespace(A=np.zeros((4, 4)))), stable=True,
-        shortfalls=(), levels=(), unverified="", judge=None, rounding=None, between=None,
+        shortfalls=(), weighted_above=(), unverified="", judge=None, rounding=None, between=None,
         target=SimpleNamespace(excess=0.05),
     )  # fmt: skip
     run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)),
                           case=SimpleNamespace(robust=RobustTable()))  # fmt: skip
-    words = f"{'; '.join(deployed_line(run, found).clauses)};"
+    words = f"{'; '.join(DeployedRun(run, found).check().clauses)};"
     assert "on the model bandwidth 48.2 Hz, peak of S 1.64;" in words
     assert "(resonances +3 %) bandwidth 48.4 Hz, peak of S 1.72" in words
 

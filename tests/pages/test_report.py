@@ -20,8 +20,8 @@ from ccd_casadi.analysis.loop_channels import scalar_channels
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.paint import block_html, draw, page_html, read_pages

@@ -7,7 +7,7 @@ import pytest
 from scipy.io import mmwrite
 from scipy.sparse import csc_array
 
-from ccd_casadi.extensions.imported.imported_command import main
+from ccd_casadi.extensions.imported import main
 from ccd_casadi.extensions.imported.matrices import modes_of
 from ccd_casadi.extensions.imported.matrix_files import MATRIX_FORMATS, read_matrix
 from ccd_casadi.extensions.imported.modal_table import read_modal_table

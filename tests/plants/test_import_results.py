@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.extensions.imported.imported_command import main
+from ccd_casadi.extensions.imported import main
 from ccd_casadi.extensions.imported.interpolation import InterpolatedModes
 from ccd_casadi.extensions.imported.modal_table import read_modal_table
 from ccd_casadi.extensions.imported.result_files import ResultModes, read_modes

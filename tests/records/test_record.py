@@ -7,7 +7,7 @@ import pytest
 from oracles.closed_loops import RATE, Loop, random_loop, recorded
 from scipy.io import savemat, wavfile
 
-from ccd_casadi.extensions.records.record_command import main
+from ccd_casadi.extensions.records import main
 from ccd_casadi.extensions.records.time_series import SignalNames, TimeSeries, read_record
 from ccd_casadi.plants.measured import read_frequency_response
 from ccd_casadi.support.errors import UserError

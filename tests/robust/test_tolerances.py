@@ -26,8 +26,8 @@ from ccd_casadi.extensions.tolerances.machines import (
     ShareCertificate,
     Trial,
     certified_share,
-    drawn,
-    judged,
+    count_failures,
+    draw_machines,
 )
 from ccd_casadi.extensions.tolerances.prices import Bought, WidthSearch, promised, scaled
 from ccd_casadi.extensions.tolerances.share_search import NoDesign, ShareOptions, ShareSearch
@@ -122,7 +122,7 @@ def test_drawn_machines_have_the_share_that_is_known(uncertain: Any, word: str) 
     """Of each tolerance alone below a level, and of two together: they are independent."""
     number, z, names = 20_000, np.array([-0.5, 0.2, 0.7]), list(uncertain.names)
     rng = np.random.default_rng(1)
-    machines = drawn(uncertain, dict.fromkeys(names, word), rng, number)
+    machines = draw_machines(uncertain, dict.fromkeys(names, word), rng, number)
     points = np.array([point for _, point in machines])
     low, high = uncertain.box
     assert (np.clip(points, low, high) == points).all()
@@ -174,7 +174,7 @@ def test_machines_that_cannot_be_evaluated_fail_alone() -> None:
         return [option < 5 for option, _ in machines]
 
     machines = [(option, np.zeros(1)) for option in (0, 1, 7, 2, 6, 7)]
-    assert judged(judge, machines) == (3, 2)
+    assert count_failures(judge, machines) == (3, 2)
 
 
 def test_the_count_is_the_same_for_any_workers_and_not_for_another_seed(uncertain: Any) -> None:

@@ -21,9 +21,9 @@ from ccd_casadi.inner_problem.searched_problem import (
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling import sampler as module
-from ccd_casadi.sampling.sample_keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.units import problem_hash
 from ccd_casadi.support.process_pool import Workers
 
 GOOD, POOR = (1.0,), (2.0,)

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 from oracles.rows import REALS, identical, sample
 
-from ccd_casadi.sampling.sample_keys import problem_hash, sample_key
 from ccd_casadi.sampling.store import Sample, SampleStore
+from ccd_casadi.sampling.units import problem_hash, sample_key
 
 # -0.0 is left out: SQLite stores it as 0, and no key or figure tells the two apart.
 numbers = st.floats().filter(lambda v: math.copysign(1.0, v) > 0.0 or v != 0.0)

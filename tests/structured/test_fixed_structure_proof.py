@@ -72,6 +72,12 @@ def test_what_the_judge_finds_is_below_what_is_proven_and_close(sampling) -> Non
     assert seen["bandwidth"] >= bandwidth / (1.0 + proof.slack)
 
 
+def test_a_slack_of_zero_is_taken_as_it_is() -> None:
+    """It was replaced by the default: a proof of more than was required."""
+    proof = prove(BOX, STRUCTURE, KAPPA, 20.0 * HZ, BOUNDS, slack=0.0, most_boxes=1)
+    assert proof.slack == 0.0
+
+
 @pytest.mark.parametrize("sampling", [None, FAST], ids=["continuous", "fast"])
 def test_a_box_with_a_plant_that_fails_is_refuted_at_a_plant_that_fails(sampling) -> None:
     bounds, bandwidth = tight(figures(sampling, BOX.corners()[:1], BOUNDS), 1.005)

@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.fixed_structure.uncertainty import ModalSum, UncertainPlant, modal_sum
 from ccd_casadi.kernels.modes import form_slopes
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import StateSpace
@@ -232,3 +232,32 @@ def test_boxes_at_rest_hold_what_loops_have_beside_zero() -> None:
         assert S.max() / bounds.S_max <= names["S_MAX"]
         shape = bounds.shape * 2.0 * np.pi * hz / family.bandwidth / np.sqrt(2.0)
         assert (S / shape).max() <= names["SHAPE"]
+
+
+@pytest.mark.parametrize("top", [1e-3, 1e-4])
+@pytest.mark.parametrize(("share", "damping"), [(0.03, 0.5), (0.1, 1.0), (0.03, 2.0)])
+def test_two_actuators_on_one_output_are_enclosed_beside_rest(top, share, damping) -> None:
+    """One moves the free body, the other a compliant mode, and their loops nearly cancel: 0.06 was
+    enclosed where |S| is 1.4, without the size of N in what the second gain moves."""
+    k, w = 20.0 * top**3, 0.85 * top
+    strength = 1.0 / share / w**2  # the loops of both are alike at w
+    first = (Structure(True, lead=0, biquads=0, roll_off=0), np.log([k, 1.0]))
+    second = (Structure(False, lead=0, biquads=0, roll_off=2),
+              np.log([2.0 * damping * share * k / w, w, damping]))  # fmt: skip
+    plant = ModalSum(
+        np.array([0.0, 1.0]), np.array([True, False]), np.zeros(2), 0.01,
+        np.diag([1.0, strength**0.5]), np.array([[1.0], [strength**0.5]]), np.zeros(2, bool),
+    )  # fmt: skip
+    bounds = Bounds(S_max=2.0, S_low=0.5, omega_low=top)
+    family = LoopFamily(plant, (), (first, second), np.ones((1, 2)), np.eye(2), bounds, 0.1, 1.0,
+                        None, 0.0)  # fmt: skip
+    edges = np.linspace(0.7 * top, top, 31)
+    s = 1j * np.linspace(0.7 * top, top, 3001)
+    K1, K2 = (structure.response(kappa, s) for structure, kappa in (first, second))
+    S = np.abs(1.0 / (1.0 + K1 / s**2 + K2 * strength / (s**2 + 0.02 * s + 1.0)))
+    for low, high in [(0.7 * top, top), *pairwise(edges)]:
+        box = Boxes(np.array([Chart.LOW]), np.array([[low]]), np.array([[high]]))
+        with np.errstate(all="ignore"):
+            found = family.enclose(box)
+        here = (s.imag >= low) & (s.imag <= high)
+        assert bounds.S_max * found.highest[found.names.index("S_MAX"), 0] >= S[here].max()

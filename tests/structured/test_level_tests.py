@@ -105,13 +105,13 @@ def test_the_second_engines_norm_does_not_hang_on_units(scale: float) -> None:
 @pytest.mark.parametrize("outcome", list(ProofOutcome))
 def test_what_no_proof_covers_is_not_passed(outcome: ProofOutcome) -> None:
     """A proof that does not apply or leaves bounds out says so, and its line is not passed."""
-    for channels in (False, True):
-        proof = Proof(outcome, 1e-3, ("shift",), {"KS": 1.0}, channels=channels, point=(0.1,),
+    for left in ("", "bounds of single channels are judged, not proven"):
+        proof = Proof(outcome, 1e-3, ("shift",), {"KS": 1.0}, left=left, point=(0.1,),
                       passed=("KS", 1.1))  # fmt: skip
-        assert bool(proof.unasked) == (channels or outcome in NOT_APPLICABLE)
-        if proof.unasked and (proof.stable or outcome in NOT_APPLICABLE):
+        assert bool(proof.unproven) == (bool(left) or outcome in NOT_APPLICABLE)
+        if proof.unproven and (proof.stable or outcome in NOT_APPLICABLE):
             assert "not proven" in proof.words
-            assert proof.unasked in proof.words
+            assert proof.unproven in proof.words
         assert ("proven for the whole box" in proof.words) == proof.proven
     assert survives(None, S_max=2.0, own=OwnSet.SEARCHED).state is State.UNKNOWN
 

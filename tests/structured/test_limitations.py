@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.extensions.limitations import main
 from ccd_casadi.extensions.limitations.bound import (
     lower_bound,
     rules_out,
@@ -23,7 +24,6 @@ from ccd_casadi.extensions.limitations.bound import (
     support_of,
     upper_bound,
 )
-from ccd_casadi.extensions.limitations.gap_command import main
 from ccd_casadi.extensions.limitations.limits import (
     Limits,
     circle,

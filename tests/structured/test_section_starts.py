@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     search_from_starts,
     started,
 )
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, redraw_section, stabilising
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.plants.plant import Mechanics
 
@@ -35,15 +35,15 @@ def test_a_redrawn_controller_differs_from_its_end_in_one_section() -> None:
     ends = list(at_random(problem, np.array([0.1, 0.3]), rng))
     names = [" ".join(name.split()[:2]) for name in structure.names]
     sections = ({"biquad 1"}, {"biquad 2"}, {"lead 1", "roll-off 1"})
-    fresh = redrawn(problem, ends, 60, rng)
+    fresh = redraw_section(problem, ends, 60, rng)
     moved = [
         {name for name, was, now in zip(names, ends[i % 2], kappa, strict=True) if was != now}
         for i, kappa in enumerate(fresh)
     ]
     assert all(any(change <= section for section in sections) for change in moved)
     assert {frozenset(change) for change in moved} == set(map(frozenset, sections))
-    assert not len(redrawn(problem_for([plant()], Structure(lead=0, biquads=0, roll_off=0), EASY),
-                           [np.zeros(2)], 5, rng))  # fmt: skip
+    gain = problem_for([plant()], Structure(lead=0, biquads=0, roll_off=0), EASY)
+    assert not len(redraw_section(gain, [np.zeros(2)], 5, rng))
 
 
 def test_starts_lift_the_loop_at_an_anti_resonance() -> None:
@@ -70,7 +70,7 @@ def test_what_is_redrawn_never_loses_what_was_found() -> None:
     pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
     first = search_from_starts(problem, pool, lambda words: None)
     ends = [end.kappa for end in distinct(first, 2)]
-    fresh = stabilising(problem, redrawn(problem, ends, 24, rng))[:3]
+    fresh = stabilising(problem, redraw_section(problem, ends, 24, rng))[:3]
     again = search_from_starts(problem, fresh, lambda words: None, before=first)
     assert again[0].merit >= first[0].merit
     assert not any(runner.running for runner in again)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ccd_casadi as ccd
+from ccd_casadi.extensions.measured import main
 from ccd_casadi.extensions.measured.line_problem import LineProblem, line_problem
 from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
-from ccd_casadi.extensions.measured.tune_command import main
 from ccd_casadi.extensions.measured.tuned_plants import present_loop
 from ccd_casadi.extensions.measured.tuning import Tuned, tune
 from ccd_casadi.fixed_structure.bounds import Bounds

@@ -19,9 +19,8 @@ from test_measured import two_by_two
 
 import ccd_casadi as ccd
 from ccd_casadi import report
-from ccd_casadi.extensions.measured import tuned_plants, tuning
+from ccd_casadi.extensions.measured import main, tuned_plants, tuning
 from ccd_casadi.extensions.measured.line_problem import line_problem
-from ccd_casadi.extensions.measured.tune_command import main
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import judge_lines, judge_loops
 from ccd_casadi.lti.loop import Sampling, sampled, tustin

@@ -14,6 +14,7 @@ from oracles import lmi
 from oracles.hard_plants import close, from_parts, regularised
 from oracles.helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
 
+from ccd_casadi.extensions.cross_check import main
 from ccd_casadi.extensions.cross_check.backends import (
     SOLVERS,
     BackendOptions,
@@ -23,7 +24,6 @@ from ccd_casadi.extensions.cross_check.backends import (
     synthesise_with,
     verdicts,
 )
-from ccd_casadi.extensions.cross_check.cross_check_command import main
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space

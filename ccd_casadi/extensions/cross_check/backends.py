@@ -4,15 +4,14 @@ A back end answers for the standard plant of H∞ control,
 
     ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 
-`riccati` is the package's own and serves plants without poles on the axis in mixed sensitivity;
-`slicot` (SB10AD) serves any standard plant. `tests/oracles/lmi.py` is a third one.
+`riccati` is the package's own, in mixed sensitivity for plants without poles on the axis; `slicot`
+(SB10AD) serves any standard plant; `tests/oracles/lmi.py` is a third one.
 
-SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988). It accepts a γ
-when its Riccati solver reports no error and the loop is stable; it tests neither X >= 0 nor the
-norm. Its γ is therefore only a search variable: a design counts when the certificate passes, and
-not otherwise. Left to itself it starts at 1e100 and goes on in steps of 0.1, which does not end;
-here the search starts at a finite γ and bisects. It is still Fortran that nothing can interrupt:
-call it through `worker_process.Runner` where the plant is not known.
+SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988). It accepts a γ when its Riccati solver
+reports no error and the loop is stable; it tests neither X >= 0 nor the norm. Its γ is therefore
+only a search variable: a design counts where the certificate passes. By default it starts at 1e100
+and descends in steps of 0.1, which does not end; here it bisects from a finite γ. It is Fortran
+that nothing can interrupt: `synthesise_with` takes a process that is killed after a limit.
 """
 
 import math
@@ -81,7 +80,8 @@ class StandardPlant:
 def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
     """[W_S S; W_KS KS; W_T T] as r to z, with y = e = r - Gu, in the plant's scaled units.
 
-    With `weights.disturbance` the four blocks, (r, d) to [W_S e; W_KS u; W_T u].
+    With a disturbance d of size `weights.delta` at the plant's input, (r, d) to [W_S e; W_KS u;
+    W_T u]: from d to u is T at the input.
     """
     p, m = len(plant.C), plant.B.shape[1]
     given = (plant.A, plant.B, plant.C, weights.scaled(plant.omega_0))
@@ -104,7 +104,7 @@ def balance(plant: StandardPlant) -> StandardPlant:
 
 @dataclass(frozen=True)
 class Attempt:
-    """γ_opt as the back end has it, and a controller that is to reach `gamma`, e or y to u.
+    """γ_opt as the back end has it, and its controller from y to u that is to reach `gamma`.
 
     `controller` is None where there is none; `reason` then says why.
     """
@@ -115,8 +115,7 @@ class Attempt:
     reason: str = ""
 
 
-# (plant, gamma_backoff=1.02): H∞ synthesis for any standard plant at that many times its own γ_opt
-Solver = Callable[..., Attempt]
+Solver = Callable[..., Attempt]  # of (plant, gamma_backoff=): a controller at gamma_backoff γ_opt
 
 
 def solve_slicot(
@@ -219,7 +218,7 @@ def synthesise_with(
         design = synthesise(plant, weights, omega_low=omega_low, gamma_backoff=gamma_backoff)
         gamma_opt, words = design.figures.gamma_opt, design.figures.outcome.value
         return BackendResult(backend, gamma_opt, design, words, time.perf_counter() - began)
-    # Free bodies are suspended in a synthesis, and its loop is judged without that.
+    # Free bodies are suspended in a synthesis; without that the norm of its loop is a little more.
     task = (SOLVERS[backend], mixed_sensitivity(plant.design_plant, weights), gamma_backoff)
     slack = 1.0 + CertifiedDesignOptions.freed if plant.family else 1.0
     try:
@@ -248,7 +247,16 @@ def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[A
 def verdicts(
     results: Sequence[BackendResult], *, options: BackendOptions = BackendOptions()
 ) -> list[BackendResult]:
-    """Check each claim by the certificates and by γ_jω of the package's design.
+    """Check each claim by the certificates and by γ_jω, which no controller is below.
+
+    A claim γ with its design is, the first that applies,
+
+        γ < (1 - below) γ_jω          wrong
+        the certificate not passed    not certified
+        γ > (1 + agree) γ_least       certified, but above the least
+        otherwise                     right
+
+    with γ_jω of the package's own design and γ_least the least certified γ that is not wrong.
 
     Parameters
     ----------
@@ -259,26 +267,26 @@ def verdicts(
     Returns
     -------
     list of BackendResult
-        With `holds` and `words`.
+        With `holds` and `words`; those without a design as they are.
     """
     ours = next(item for item in results if item.backend == RICCATI)
-    bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
-    proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
-    lowest = min((g for g in proven if not g < bound * (1.0 - options.below)), default=math.nan)
-
-    def judged(item: BackendResult) -> BackendResult:
-        if item.design is None:
-            return item
-        if item.gamma_opt < bound * (1.0 - options.below):
+    bound = math.nan if ours.design is None else ours.design.figures.gamma_lower_bound
+    too_low = [item.gamma_opt < bound * (1.0 - options.below) for item in results]
+    right = [item.gamma_opt for item, low in zip(results, too_low, strict=True)
+             if item.certified and item.gamma_opt > 0.0 and not low]  # fmt: skip
+    least = min(right, default=math.nan)
+    checked = []
+    for item, low in zip(results, too_low, strict=True):
+        holds, words = False, "certified"
+        if low:
             short = 100.0 * (1.0 - item.gamma_opt / bound)
             words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
         elif not item.certified:
             words = f"not certified: {item.words}"
-        elif item.gamma_opt > lowest * (1.0 + options.agree):
-            over = 100.0 * (item.gamma_opt / lowest - 1.0)
+        elif item.gamma_opt > least * (1.0 + options.agree):
+            over = 100.0 * (item.gamma_opt / least - 1.0)
             words = f"certified, but {over:.2g} % above the least"
         else:
-            return replace(item, holds=True, words="certified")
-        return replace(item, holds=False, words=words)
-
-    return [judged(item) for item in results]
+            holds = True
+        checked.append(item if item.design is None else replace(item, holds=holds, words=words))
+    return checked

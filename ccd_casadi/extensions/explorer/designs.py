@@ -36,9 +36,9 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.sampling.sample_keys import hashes_of, sample_key
 from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.unit_kinds import units_of
+from ccd_casadi.sampling.units import hashes_of, sample_key
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ

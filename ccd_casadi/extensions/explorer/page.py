@@ -98,11 +98,13 @@ class ExplorerPage:
         run, problem = session.run, session.problems.at(session.start)
         self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
-        self._open, self._moves = True, 0
-        self._scheduled = self._let_go = self._of_search = self._notching = False
+        self._open, self._moves = True, 0  # moves of sliders up to now
+        self._answer_due = False  # to all moves since the last answer,
+        self._let_go = self._of_search = False  # one of which let go, or a search alone answers
+        self._notch_due = False
         self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
-        self._seen: list[ExploredDesign] = []  # to be written into the store
-        self._newest: Knobs | None = None  # to be searched, while a search is under way
+        self._unsaved: list[ExploredDesign] = []  # to be written into the store
+        self._to_search: Knobs | None = None  # the newest place, while a search is under way
         self.now: Drawn | None = None
         known = known_bandwidths(problem, self._surrogate, read_truths(session.store.path, problem))
         self.map.choose(steepest_axes(known, problem.lower, problem.upper))
@@ -118,7 +120,7 @@ class ExplorerPage:
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
         self.design = button("Design sections here", "design", self.design_structured, dark)
-        self._designs, self._began = False, session.kappa is not None
+        self._is_designing, self._design_began = False, session.kappa is not None
         self.solve_button = button("Solve from here", "solve", self.start_solve, dark)
         self.stop = button("Stop the solve", "stop", self.stop_solve, dark)
         self.stop.disabled = True
@@ -143,11 +145,12 @@ class ExplorerPage:
             "notch_place": [self.notch.root()],
         } | {f"{made.name}_place": [made.figure] for made in self.figures}
         roots |= {f"{places.name}_place": [places.figure] for places in self.places}
-        for name, parts in roots.items():
-            for part in parts:
-                if part.sizing_mode is None:
-                    part.sizing_mode = fill
-            self.document.add_root(column(*parts, name=name, sizing_mode=fill))
+        with self.document.models.freeze():  # its models are collected once, not for every root
+            for name, parts in roots.items():
+                for part in parts:
+                    if part.sizing_mode is None:
+                        part.sizing_mode = fill
+                self.document.add_root(column(*parts, name=name, sizing_mode=fill))
         names = {made.name: made.heading for made in self.figures} | {"landscape": "Landscape"}
         label = CustomJS(args={"names": names}, code=package_text(f"{ASSETS}/label.js"))
         self.document.js_on_event(DocumentReady, label)
@@ -168,8 +171,8 @@ class ExplorerPage:
         """
         self._let_go, self._of_search = self._let_go or let_go, self._of_search or of_search
         self._moves += 1
-        if not self._scheduled:
-            self._scheduled = True
+        if not self._answer_due:
+            self._answer_due = True
             self._answer_after(self._moves)
 
     def _answer_after(self, moves: int) -> None:
@@ -189,27 +192,26 @@ class ExplorerPage:
             self.moved(False)
 
     def _answer(self) -> None:
-        self._scheduled, let_go, self._let_go = False, self._let_go, False
-        search = self._of_search and self.session.quick
-        self._of_search = False
+        """The design at the sliders: of a full search where a slider was let go or only a search
+        answers, else of the last break frequencies. On a slow plant the search comes later."""
+        let_go, search = self._let_go, self._of_search and self.session.quick
+        self._answer_due = self._let_go = self._of_search = False
         self._kept.knobs = knobs = self.controls.knobs()
-        structured = knobs.structured
-        self.design.disabled = self._designs or not structured
+        structured, slow = knobs.structured, self.session.known is not None
+        self.design.disabled = self._is_designing or not structured
         full = (let_go or search or bool(self.controls.always.active)) and not structured
-        behind = full and self.session.known is not None
         try:
-            here = full and not behind
-            design = self.session.full(knobs) if here else self.session.live(knobs)
+            design = self.session.full(knobs) if full and not slow else self.session.live(knobs)
         except UserError as error:
             self._complain(str(error))
             return
         self.note.text = ""
         self.show(design)
-        if behind:
+        if full and slow:
             self._search_behind(knobs)
         if let_go:
             self.settle()
-        if structured and not self._began and self.session.known is None:
+        if structured and not self._design_began and not slow:
             self.design_structured()  # no page stays without a controller
 
     def _complain(self, words: str) -> None:
@@ -221,7 +223,7 @@ class ExplorerPage:
         design = with_sampled(design, sampled)
         self._shown = design, curves_of(design), sampled
         self._paint()
-        self._seen.append(design)
+        self._unsaved.append(design)
         if self._first is None and design.how is not How.PRESENT:
             self._first = "the first one", design.bandwidth_hz
 
@@ -257,12 +259,12 @@ class ExplorerPage:
 
     def _notch_moved(self) -> None:
         """Once for all moves of the pointer that came meanwhile."""
-        if self.now is not None and not self._notching:
-            self._notching = True
+        if self.now is not None and not self._notch_due:
+            self._notch_due = True
             self.document.add_timeout_callback(self._notch_again, TOGETHER)
 
     def _notch_again(self) -> None:
-        self._notching = False
+        self._notch_due = False
         self._paint()
 
     def settle(self) -> None:
@@ -270,7 +272,7 @@ class ExplorerPage:
         self.document.add_next_tick_callback(self._settled)
 
     def _settled(self) -> None:
-        seen, self._seen = self._seen, []
+        seen, self._unsaved = self._unsaved, []
         self.session.keep(seen)
         self.draw_map()
 
@@ -291,7 +293,7 @@ class ExplorerPage:
 
     # the background
 
-    def _then(self, action: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _in_turn(self, action: Callable[[Any], None]) -> Callable[[Any], None]:
         """The action in this document's own turn, whatever thread calls."""
 
         def later(found: Any) -> None:
@@ -302,16 +304,17 @@ class ExplorerPage:
 
     def _search_behind(self, knobs: Knobs) -> None:
         """The exact elements and the full search of the newest place, one at a time."""
-        busy, self._newest = self._newest is not None, knobs
+        is_busy, self._to_search = self._to_search is not None, knobs
         self.note.text = "<p>solving the model and searching at this θ …</p>"
-        if not busy:
+        if not is_busy:
             task = (self.session.problems.at(knobs), knobs)
             search = self.background.ask(searched_exactly, task)
-            self.background.answer(search, self._then(self._searched), self._then(self._failed))
+            failed = self._in_turn(self._search_failed)
+            self.background.answer(search, self._in_turn(self._searched), failed)
 
     def _searched(self, found: tuple[ExploredDesign, str]) -> None:
         design, modes = found
-        newest, self._newest = self._newest, None
+        newest, self._to_search = self._to_search, None
         known = self.session.known
         assert known is not None
         self.note.text = ""
@@ -321,18 +324,18 @@ class ExplorerPage:
             words = f"the frequencies drawn while you dragged were off by {100.0 * off:.2g} % here"
             self.note.text = f"<p>{words}</p>"
         if len(known.exact) > count:
-            self.background.renew(known, self._then(lambda _: self.improved()))
+            self.background.renew(known, self._in_turn(lambda _: self.improved()))
         self.modes.text = modes
         if newest in (None, design.knobs) and self.controls.knobs() == design.knobs:
             self.show(design)
         else:
-            self._seen.append(design)
+            self._unsaved.append(design)
         if newest is not None and newest != design.knobs:
             self._search_behind(newest)
         self.settle()
 
-    def _failed(self, error: BaseException) -> None:
-        self._newest, self._designs = None, False
+    def _search_failed(self, error: BaseException) -> None:
+        self._to_search = None
         self._complain(str(error))
 
     def design_structured(self) -> None:
@@ -343,20 +346,29 @@ class ExplorerPage:
 
     def waits_for(self, design: Future) -> None:
         """A design is under way, which this page shows once it ends."""
-        self.design.disabled = self._designs = self._began = True
+        self.design.disabled = self._is_designing = self._design_began = True
         self._designing("it takes seconds")
-        self.background.answer(design, self._then(self._designed), self._then(self._failed))
+        failed = self._in_turn(self._design_failed)
+        self.background.answer(design, self._in_turn(self._designed), failed)
 
     def heard(self, words: str) -> None:
         """How far a design is, in any thread."""
-        self._then(self._designing)(words)
+        self._in_turn(self._designing)(words)
 
     def _designing(self, words: str) -> None:
-        if self._designs:  # not of one that has ended
+        if self._is_designing:  # not of one that has ended
             self.note.text = f"<p>designing a controller at this θ: {escape(words)} …</p>"
 
+    def _end_design(self) -> None:
+        self._is_designing, self.note.text = False, ""
+        self.design.disabled = not self.controls.knobs().structured
+
+    def _design_failed(self, error: BaseException) -> None:
+        self._end_design()
+        self._complain(str(error))
+
     def _designed(self, found: Designed) -> None:
-        self.design.disabled, self._designs, self.note.text = False, False, ""
+        self._end_design()
         design = self.session.took_designed(found)
         if design is None:
             self._complain(found.words)
@@ -387,16 +399,16 @@ class ExplorerPage:
         folder, case = self.session.folder_for_solve(self.controls.knobs())
         self._output, self._solved = [f"solving into {folder}"], folder
         self.solve_button.disabled, self.stop.disabled = True, False
-        said, ended = self._then(self._said), self._then(self._ended)
+        said, ended = self._in_turn(self._print_line), self._in_turn(self._solve_ended)
         self.solve = Solve(case, folder, self._of_solves, said, ended)
-        self._said("")
+        self._print_line("")
 
     def stop_solve(self) -> None:
         """As Ctrl-C."""
         if self.solve is not None:
             self.solve.stop()
 
-    def _said(self, line: str) -> None:
+    def _print_line(self, line: str) -> None:
         if BAR.search(line) and BAR.search(self._output[-1]):
             self._output[-1] = line
         elif line:
@@ -404,11 +416,11 @@ class ExplorerPage:
         shown = "\n".join(self._output[:1] + self._output[1:][-LINES:])
         self.output.text = f"<pre>{escape(shown)}</pre>"
 
-    def _ended(self, code: int) -> None:
+    def _solve_ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
         known = {exit_code.value: exit_code.words for exit_code in ExitCode}
-        self._said(f"the solve ended: {known.get(code, f'exit code {code}')}")
-        if code in (0, 4):
+        self._print_line(f"the solve ended: {known.get(code, f'exit code {code}')}")
+        if code in (ExitCode.DONE, ExitCode.NOT_VERIFIED):
             self._go_to_solved()
         if (self._solved / "report.html").exists():
             place = f"{SOLVED}/{self._solved.name}/report.html"
@@ -428,5 +440,5 @@ class ExplorerPage:
         """The page was closed: a solve goes on only while somebody sees it."""
         self._open = False
         self.stop_solve()
-        self.session.keep(self._seen)
-        self._seen = []
+        self.session.keep(self._unsaved)
+        self._unsaved = []

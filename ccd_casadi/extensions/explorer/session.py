@@ -30,9 +30,8 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import lumped
 from ccd_casadi.sampling.inner_samples import sample_of
-from ccd_casadi.sampling.sample_keys import hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.units import unit_of
+from ccd_casadi.sampling.units import hashes_of, problem_hash, sample_key, unit_of
 from ccd_casadi.support.terminal import Tell
 from surrogates.files import write_whole
 

@@ -225,7 +225,7 @@ def line_problem(
     U, V = structure.directions
     out, into = (np.ascontiguousarray(M, float) for M in (U.T, V))
     poles, residues = _modes(omega, force * G, T)
-    plants = LinePlants((), omega_0, force, T, 0.0, poles, residues, out, into, omega)
+    plants = LinePlants((), omega_0, force, T, 0.0, poles, residues, out, into, omega=omega)
     fastest = 3.0 * HZ * max(one[-1] for one in hz) / omega_0
     if plants.period is not None:
         fastest = min(fastest, 2.0 / plants.period)

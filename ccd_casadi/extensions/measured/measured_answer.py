@@ -53,17 +53,7 @@ def measured_answer(
 
 
 def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
-    """Describe a design on the lines of a case under the keys of `inner`.
-
-    Parameters
-    ----------
-    case : MeasuredCase
-    design : MeasuredDesign
-
-    Returns
-    -------
-    InnerAnswer
-    """
+    """Describe a design on the lines of a case under the keys of `inner`."""
     hz = case.responses[0].hz
     plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
     figures: dict[str, Any] = {"plant": plant, "theta": {}, "words": design.words, "syntheses": 1}

@@ -60,19 +60,7 @@ class MatrixEstimate:
 def read_channels(
     path: Path, names: SignalNames, forces: Sequence[str], positions: Sequence[str]
 ) -> list[list[TimeSeries]]:
-    """Read a record as one of every force (rows) and every position (columns).
-
-    Parameters
-    ----------
-    path, names : Path, SignalNames
-        What is common to all.
-    forces, positions : sequence of str
-        Columns.
-
-    Returns
-    -------
-    list of list of TimeSeries
-    """
+    """Read a record as one of every force (rows) and every position (columns)."""
     return [[read_record(path, replace(names, force=force, position=position))
              for position in positions] for force in forces]  # fmt: skip
 

@@ -108,16 +108,7 @@ RATE, NAME, FILE, UNIT = "SampleTime[ms]", "Name", "File", "Unit"
 
 
 def is_scope(text: str) -> bool:
-    """Whether a text is such an export.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    bool
-    """
+    """Whether a text is such an export."""
     lines = text.splitlines()[:30]
     return len(lines) > 1 and lines[0].startswith(NAME) and lines[1].startswith(FILE + _mark(lines))
 

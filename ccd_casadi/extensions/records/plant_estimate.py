@@ -221,12 +221,7 @@ def quantile_of(degrees: Array, options: EstimateOptions) -> Array:
 
 
 def require_alive(series: TimeSeries) -> None:
-    """Raise UserError where a signal is constant.
-
-    Parameters
-    ----------
-    series : TimeSeries
-    """
+    """Raise UserError where a signal is constant."""
     if not np.ptp(series.excitation) > 0.0:
         raise UserError("the excitation is constant, so nothing moves the plant; name another "
                         "column (--injected, --reference)")  # fmt: skip

@@ -124,19 +124,7 @@ ROWS = ((5.0, 2.9), (2.75, 1.75), (0.55, 1.75))  # bottom and height, inches
 
 
 def record_picture(found: PlantEstimate, confidence: float) -> bytes:
-    """Draw a response.
-
-    Parameters
-    ----------
-    found : PlantEstimate
-    confidence : float
-        Of its spread.
-
-    Returns
-    -------
-    bytes
-        A PNG file.
-    """
+    """Draw a response."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     hz, size, used = found.hz, np.abs(found.G), found.used

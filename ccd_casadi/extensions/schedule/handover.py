@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.extensions.schedule.segments import Segment
+from ccd_casadi.extensions.schedule.segments import DesignedPart, Segment
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
@@ -76,12 +76,12 @@ class RateTrial:
     left: float
 
 
-def controllers_of(segments: Sequence[Segment], sampling: Sampling) -> list[StateSpace]:
+def controllers_of(parts: Sequence[DesignedPart], sampling: Sampling) -> list[StateSpace]:
     """K(z) of every part, by Tustin's rule."""
     found = []
-    for segment in segments:
-        assert segment.design.controller is not None
-        found.append(tustin(segment.design.controller, sampling.period))
+    for part in parts:
+        assert part.design.controller is not None
+        found.append(tustin(part.design.controller, sampling.period))
     return found
 
 

@@ -19,7 +19,14 @@ from ccd_casadi.extensions.schedule.handover import (
     handovers,
 )
 from ccd_casadi.extensions.schedule.rate_bound import RateBound
-from ccd_casadi.extensions.schedule.segments import Alone, ScheduleOptions, Segment, refined, within
+from ccd_casadi.extensions.schedule.segments import (
+    Alone,
+    DesignedPart,
+    ScheduleOptions,
+    Segment,
+    refined,
+    within,
+)
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
@@ -134,20 +141,20 @@ class Schedule:
 
 
 def frozen_positions(
-    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
+    problem: CoDesignProblem, theta: Sequence[float], name: str, parts: Sequence[DesignedPart],
     positions: Sequence[float],
 ) -> list[FrozenPosition]:  # fmt: skip
     """Judge every part where it may control, on the model and the corners of its set there."""
     sampling, bounds = structured_of(problem).sampling, bounds_of(problem)
     assert sampling is not None
-    K, integrator = controllers_of(segments, sampling), structure_of(problem).integrator
+    K, integrator = controllers_of(parts, sampling), structure_of(problem).integrator
     found, own = [], uncertain_plant(problem, theta)
     at = own.names.index(f"theta.{name}")
     corners = uncertain_plant(within(problem, name, positions[0], positions[0]), theta).corners()
     for p in positions:
         plants = own.as_written([(option, np.insert(one, at, p)) for option, one in corners])
         failed, bandwidth = [], np.inf
-        for i, (one, coded) in enumerate(zip(segments, K, strict=True)):
+        for i, (one, coded) in enumerate(zip(parts, K, strict=True)):
             if not one.low <= p <= one.high:
                 continue
             assert one.design.controller is not None
@@ -161,31 +168,29 @@ def frozen_positions(
 
 
 def kept_at_positions(
-    problem: CoDesignProblem, theta: Sequence[float], name: str, segments: Sequence[Segment],
+    problem: CoDesignProblem, theta: Sequence[float], name: str, parts: Sequence[DesignedPart],
     count: int, *, workers: Pool, tell: Tell = silent,
     options: ScheduleOptions = ScheduleOptions(),
-) -> tuple[list[Segment], list[FrozenPosition]]:  # fmt: skip
+) -> tuple[list[DesignedPart], list[FrozenPosition]]:  # fmt: skip
     """Judge the parts at positions; where one exceeds a bound, design it anew and judge at others.
 
     These are even over the range, `count` of them; after a new design those between. What is
     returned are the parts in the end, with their positions.
     """
-    segments, places = list(segments), np.linspace(segments[0].low, segments[-1].high, count)
+    parts, places = list(parts), np.linspace(parts[0].low, parts[-1].high, count)
     for turn in range(options.refinements + 1):
         tell(f"{count} positions are judged")
-        found = frozen_positions(problem, theta, name, segments, places.tolist())
+        found = frozen_positions(problem, theta, name, parts, places.tolist())
         late = {i for one in found for i in one.failed}
         if not late or turn == options.refinements:
             break
         for i in late:
             own = [one.at for one in found if i in one.failed]
             tell(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
-            segments[i] = refined(
-                segments[i], theta, name, own, workers=workers, tell=tell, options=options
-            )
+            parts[i] = refined(parts[i], theta, name, own, workers=workers, tell=tell)
         between = 0.5 * (places[1:] + places[:-1])
         places = np.concatenate([places[:1], between, places[-1:]])  # the ends are corners
-    return segments, found
+    return parts, found
 
 
 def entry(found: Schedule) -> dict[str, Any]:

@@ -63,8 +63,8 @@ class ScheduleOptions:
 
 
 @dataclass(frozen=True)
-class Segment:
-    """A part of the range and its controller.
+class DesignedPart:
+    """A part of the range with the controller that was found for it.
 
     Attributes
     ----------
@@ -73,16 +73,26 @@ class Segment:
     problem : CoDesignProblem
         With p in [low, high], and with what the search found.
     design : SectionsDesign
-    judgement : Judgement
-        On plants of the part.
-    proof : Proof
-        On all of the part.
     """
 
     low: float
     high: float
     problem: CoDesignProblem
     design: SectionsDesign
+
+
+@dataclass(frozen=True)
+class Segment(DesignedPart):
+    """A part that was judged.
+
+    Attributes
+    ----------
+    judgement : Judgement
+        On plants of the part.
+    proof : Proof
+        On all of the part.
+    """
+
     judgement: Judgement
     proof: Proof
 
@@ -132,16 +142,6 @@ def within(problem: CoDesignProblem, name: str, low: float, high: float) -> CoDe
     return with_state(found, warm_starts=(), scenarios=())
 
 
-@dataclass(frozen=True)
-class DesignedPart:
-    """A part of the range with the controller that was found for it."""
-
-    low: float
-    high: float
-    problem: CoDesignProblem
-    design: SectionsDesign
-
-
 Search = Callable[[float, float, SectionsDesign | None], DesignedPart]
 
 
@@ -163,12 +163,11 @@ def segments_of(
     problem: CoDesignProblem, theta: Sequence[float], name: str, *,
     workers: Pool, tell: Tell = silent,
     options: ScheduleOptions = ScheduleOptions(),
-) -> tuple[list[Segment], list[Alone], float]:  # fmt: skip
+) -> tuple[list[DesignedPart], list[Alone], float]:  # fmt: skip
     """Halve the range until every part has its share of what its positions have alone.
 
-    Returns the parts, ascending, each judged and where it can be proven; the positions alone; and
-    ω_b of one controller for the whole range, rad/s. Where none keeps every bound on it, it is a
-    UserError.
+    Returns the parts, ascending; the positions alone; and ω_b of one controller for the whole
+    range, rad/s. Where none keeps every bound on it, it is a UserError.
     """
     problem = with_range(replace(problem, start=tuple(theta)))  # one range of K for every part
     low, high = next((a, b) for own, a, b in structured_of(problem).uncertainty.ranges
@@ -189,8 +188,7 @@ def segments_of(
     if not whole.design.certified:
         words = f"no controller for the whole range to begin with: {whole.design.words}"
         raise UserError(f"schedule: {words}")
-    parts = halved(whole, alone, search, tell, options)
-    return _judged(parts, theta, tell, workers, options.boxes), alone, whole.design.bandwidth
+    return halved(whole, alone, search, tell, options), alone, whole.design.bandwidth
 
 
 def halved(
@@ -228,36 +226,34 @@ def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
 
 
 def refined(
-    segment: Segment, theta: Sequence[float], name: str, positions: Sequence[float], *,
-    workers: Pool, tell: Tell = silent, options: ScheduleOptions = ScheduleOptions(),
-) -> Segment:  # fmt: skip
+    part: DesignedPart, theta: Sequence[float], name: str, positions: Sequence[float], *,
+    workers: Pool, tell: Tell = silent,
+) -> DesignedPart:  # fmt: skip
     """Design a part anew from its own controller, with the plants at some positions in its set.
 
-    It is judged again; the same is returned where no controller keeps the wider set.
+    The same is returned where no controller keeps the wider set.
     """
-    own = uncertain_plant(segment.problem, theta)
+    own = uncertain_plant(part.problem, theta)
     row = np.arange(len(own.names)) == own.names.index(f"theta.{name}")
     more = [(option, tuple(np.where(row, p, corner).tolist()))
             for p in positions for option, corner in own.corners()]  # fmt: skip
-    known = state_of(segment.problem).scenarios
+    known = state_of(part.problem).scenarios
     problem = with_state(
-        segment.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
-        warm_starts=(tuple(map(float, segment.design.kappa)),),
+        part.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
+        warm_starts=(tuple(map(float, part.design.kappa)),),
     )  # fmt: skip
     made = search_starts(problem, theta, tell, workers, True)
-    if not made.certified:
-        return segment
-    part = DesignedPart(segment.low, segment.high, problem, made)
-    return _judged([part], theta, tell, workers, options.boxes)[0]
+    return replace(part, problem=problem, design=made) if made.certified else part
 
 
-def _judged(
-    parts: Sequence[DesignedPart], theta: Sequence[float], tell: Tell, workers: Pool, boxes: int
-) -> list[Segment]:
-    """Judge and prove every part; the proofs are spread over the workers."""
+def judge_parts(
+    parts: Sequence[DesignedPart], theta: Sequence[float], *, workers: Pool, tell: Tell = silent,
+    options: ScheduleOptions = ScheduleOptions(),
+) -> list[Segment]:  # fmt: skip
+    """Judge and prove every part; the proofs, which take longest, are spread over the workers."""
     tell(f"judge and proof of {counted(len(parts), 'part')}")
     on_boxes = [DesignOnBox(part.problem, tuple(theta), part.design) for part in parts]
-    tasks = {i: (one, None, boxes) for i, one in enumerate(on_boxes)}
+    tasks = {i: (one, None, options.boxes) for i, one in enumerate(on_boxes)}
     proofs, found = dict(results(workers, DesignOnBox.proof, tasks)), []
     for i, (part, on_box) in enumerate(zip(parts, on_boxes, strict=True)):
         judgement = judgement_of(*on_box.on_lattice(on_box.worst(workers=workers)[0], workers))

@@ -286,20 +286,7 @@ def share_answer(found: ShareDesign) -> Answer:
 
 
 def price_answer(run: FinishedRun, sampler: Sampler, quiet: bool) -> Answer:
-    """The price list of a run; with `cost_per_percent` the half-widths that cost least.
-
-    Parameters
-    ----------
-    run : FinishedRun
-        With sections.
-    sampler : Sampler
-        Of its problem.
-    quiet : bool
-
-    Returns
-    -------
-    Answer
-    """
+    """The price list of a run; with `cost_per_percent` the half-widths that cost least."""
 
     def tell(words: str) -> None:
         remark(f"prices: {words}", quiet)

@@ -60,28 +60,32 @@ class MachineOptions:
 
 
 def tolerance_of(name: str) -> str:
-    """The tolerance of an uncertain parameter: one for the shifts of all single modes."""
+    """The tolerance of a parameter of the box; "mode_shift 3" has that of all, "mode_shift"."""
     return name.split(" ")[0]
 
 
-def drawn(
+def draw_machines(
     uncertain: UncertainPlant,
     distribution: Mapping[str, str],
     rng: np.random.Generator,
     number: int,
     options: MachineOptions = MachineOptions(),
 ) -> list[Machine]:
-    """Draw options and points (n,) of the box; uniform where a tolerance has no distribution."""
+    """Draw options and points (n,) of the box; uniform where a tolerance has no distribution.
+
+    From u, uniform on [0, 1], z = Φ⁻¹(c + u(1 - 2c))/sigmas, c = Φ(-sigmas), is normal and cut off
+    at ±1, the ends of the range. It scales the distance from the model to the end on its side; of
+    the factor of damping, its logarithm.
+    """
     option = rng.integers(len(uncertain.options), size=number).tolist()
-    unit = rng.random((number, len(uncertain.names)))
-    points = np.empty_like(unit)
+    u = rng.random((number, len(uncertain.names)))
+    points, cut = np.empty_like(u), ndtr(-options.sigmas)
     ends = zip(uncertain.names, *uncertain.box, uncertain.nominal, strict=True)
     for k, (name, low, high, model) in enumerate(ends):
         if distribution.get(tolerance_of(name), "uniform") == "uniform":
-            points[:, k] = low + unit[:, k] * (high - low)
+            points[:, k] = low + u[:, k] * (high - low)
             continue
-        cut = ndtr(-options.sigmas)
-        z = ndtri(cut + unit[:, k] * (1.0 - 2.0 * cut)) / options.sigmas  # from -1 to 1
+        z = ndtri(cut + u[:, k] * (1.0 - 2.0 * cut)) / options.sigmas
         if name == "damping":
             points[:, k] = model * np.where(z < 0.0, (low / model) ** -z, (high / model) ** z)
         else:
@@ -91,7 +95,8 @@ def drawn(
 
 @dataclass(frozen=True)
 class Trial:
-    """Fresh rounds of the certificate's number of draws, and the most failures in all of them."""
+    """What accepts a design: `rounds` times the certificate's number of fresh draws, of which at
+    most `allowed` fail in all."""
 
     rounds: int
     allowed: int
@@ -117,12 +122,12 @@ class Plan:
         return ceil(self.options.enough * log1p(-self.confidence) / log(self.share))
 
     def shown(self, failed: int) -> float:
-        """The least share of all machines where that many of the draws fail."""
+        """The share of all machines that is shown to keep the bounds if `failed` draws do not."""
         return yield_bound(self.draws - failed, self.draws, self.confidence)
 
     @cached_property
     def allowed(self) -> int:
-        """The most of them that may fail."""
+        """The most of the certificate's draws that may fail."""
         return next(m for m in count() if self.shown(m + 1) < self.share)
 
     @cached_property
@@ -136,9 +141,9 @@ class Plan:
             both                A(q) B(q) <= s = max over q of A B
             any of `attempts`   at most attempts s <= 1 - reliable, by the sum
 
-        c is the largest that keeps this, for the least r from `confirming` on that has one. So
-        20 certificates of the design of a search all pass but for a chance of 20 (1 - reliable).
-        Failures are counted anew for each design: no design is accepted by draws that made it.
+        c is the largest that keeps this, for the least r from `confirming` on that has one; the
+        largest A B is taken over a grid of q about 1 - share. Failures are counted anew for each
+        design: no design is accepted by draws that made it.
         """
         q = np.minimum((1.0 - self.share) * np.geomspace(1e-3, 1e2, 2000), 1.0)
         refused = self.options.attempts * bdtrc(self.allowed, self.draws, q)
@@ -189,17 +194,17 @@ class ShareCertificate:
 
     @property
     def least(self) -> float:
-        """The share that is shown, at the confidence."""
+        """The share of all machines that is shown, at the confidence."""
         return self.plan.shown(self.failed)
 
     @property
     def passed(self) -> bool:
-        """Whether it is the share that is required."""
+        """Whether the share that is shown is at least that which is required."""
         return self.least >= self.plan.share
 
     @property
     def line(self) -> Check:
-        """Of the verdict. It says nothing of the whole box."""
+        """The line of the verdict. It says nothing of the whole box."""
         plan, state = self.plan, State.PASSED if self.passed else State.FAILED
         claim = RobustTable(share=plan.share, confidence=plan.confidence).share_words
         shown = (Reason.SHARE_SHOWN if self.passed else Reason.SHARE_NOT_SHOWN)(claim=claim)
@@ -217,17 +222,17 @@ class ShareCertificate:
         }  # fmt: skip
 
 
-Judge = Callable[[list[Machine]], list[bool]]
+Judge = Callable[[list[Machine]], list[bool]]  # which machines keep every bound
 
 
-def judged(judge: Judge, machines: list[Machine]) -> tuple[int, int]:
+def count_failures(judge: Judge, machines: list[Machine]) -> tuple[int, int]:
     """Count failing machines, and how many of these could not be evaluated."""
     try:
         return sum(not kept for kept in judge(machines)), 0
     except Exception:  # a plant function may raise anything: each by itself, to find which
         if len(machines) == 1:
             return 1, 1
-    each = [judged(judge, [one]) for one in machines]
+    each = [count_failures(judge, [one]) for one in machines]
     return sum(failed for failed, _ in each), sum(lost for _, lost in each)
 
 
@@ -254,8 +259,8 @@ def certified_share(
     ShareCertificate
     """
     rng = np.random.default_rng((seed, options.seed))
-    fresh = drawn(on_box.uncertain, distribution, rng, plan.draws)
+    fresh = draw_machines(on_box.uncertain, distribution, rng, plan.draws)
     size = options.batch
     tasks = {i: (on_box.kept, fresh[i : i + size]) for i in range(0, len(fresh), size)}
-    counts = dict(results(workers, judged, tasks)).values()
+    counts = dict(results(workers, count_failures, tasks)).values()
     return ShareCertificate(plan, *(sum(each) for each in zip(*counts, strict=True)))

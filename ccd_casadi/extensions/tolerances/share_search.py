@@ -19,7 +19,7 @@ import numpy as np
 
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
-from ccd_casadi.extensions.tolerances.machines import Machine, Plan, Trial, drawn
+from ccd_casadi.extensions.tolerances.machines import Machine, Plan, Trial, draw_machines
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
@@ -140,7 +140,7 @@ class ShareSearch:
         """After a round of new draws; how many machines of it fail."""
         rng = np.random.default_rng((self.seed, options.seed, self.rounds))
         uncertain = uncertain_plant(self.problem, self.best.theta)
-        new = drawn(uncertain, self.distribution, rng, self.plan.draws)
+        new = draw_machines(uncertain, self.distribution, rng, self.plan.draws)
         value = self.excesses(new)
         nearest = [new[i] for i in np.argsort(-value, kind="stable")[: options.tail]]
         wider = replace(self, tail=(*self.tail, *nearest), rounds=self.rounds + 1)

@@ -295,19 +295,7 @@ def search_error(sampler: Sampler, best: InnerSample) -> float:
 
 
 def worth_words(result: Mapping[str, Any], *, options: WorthOptions = WorthOptions()) -> list[str]:
-    """Write the decision, what a full solve may add, both designs and their cost.
-
-    Parameters
-    ----------
-    result : mapping
-        The content of worth.json.
-    options : WorthOptions
-
-    Returns
-    -------
-    list of str
-        Lines; the decision first.
-    """
+    """Write the decision, what a full solve may add, both designs and their cost."""
     lines = ["answer        Co-design is needed: the sequential hardware has no controller."]
     if np.isfinite(result["bandwidth_percent"]):
         negligible = result["gain_percent"] + result["uncertainty_percent"] < options.least_gain
