@@ -137,9 +137,10 @@ def sheet_figures(
 
 def _margin_words(one: Mapping[str, Any]) -> str:
     """The margins of the loop broken at one place, the least of model and corners."""
+    down = f"× {number(one['gain_down'], 2)}" if one["gain_down"] else "any"
     return (f"phase {number(one['phase_margin_deg'], 3)}°, gain × {number(one['gain_up'], 3)} up "
-            f"and × {number(one['gain_down'], 2)} down, delay {number(one['delay_margin_us'], 3)} "
-            f"µs, modulus {number(one['modulus_margin'], 3)}")  # fmt: skip
+            f"and {down} down, delay {number(one['delay_margin_us'], 3)} µs, "
+            f"modulus {number(one['modulus_margin'], 3)}")  # fmt: skip
 
 
 def _peaks(problem: DriveProblem, design: DriveDesign) -> str:
