@@ -51,6 +51,8 @@ class LoopFigureOptions:
         About its end, in which a step has settled.
     decayed : float
         Of its largest displacement, what is left where a step of force has decayed.
+    coupled : float
+        Of what moves an output most, the least that a force moves it where it is not rounding.
     warnings : LoopWarningOptions
         Of what is warned of.
     """
@@ -62,6 +64,7 @@ class LoopFigureOptions:
     per_period: int = 100
     band: float = 0.02
     decayed: float = 0.1
+    coupled: float = 1e-6
     warnings: LoopWarningOptions = field(default_factory=LoopWarningOptions)
 
     @property
@@ -207,7 +210,8 @@ def largest_force_step(
     found, decay = [], 0.0
     for plant, loop in enumerate(loops):
         times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
-        left = np.abs(y) > options.decayed * np.abs(y).max(axis=2, keepdims=True)
+        each = np.abs(y).max(axis=2, keepdims=True)
+        left = np.abs(y) > np.maximum(options.decayed * each, options.coupled * each.max(axis=0))
         last = int(np.flatnonzero(left.any(axis=(0, 1)))[-1])
         decay = max(decay, float(times[last]) if last + 1 < len(times) else np.inf)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))

@@ -54,11 +54,20 @@ class QuadratureOptions:
         Largest number of bisections of a panel.
     most_evaluations : int
         Nodes after which no panel is bisected any more.
+    trusted : float
+        Relative difference of Lyapunov's equation beyond which the integral counts: states far
+        apart in scale, as of a gain of 1e11 N/m, leave the equation no digits.
     """
 
     tolerance: float = 1e-9
     rounds: int = 40
     most_evaluations: int = 200_000
+    trusted: float = 1e-3
+
+
+def distrusted(disagreement: float, options: QuadratureOptions = QuadratureOptions()) -> bool:
+    """Whether Lyapunov's equation has lost its digits, so that the integral counts."""
+    return options.trusted < disagreement < np.inf
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg.lapack import dgees, dtrsyl
 
-from ccd_casadi.budget.error_density import integrate, integrated, panels, responses
+from ccd_casadi.budget.error_density import distrusted, integrate, integrated, panels, responses
 from ccd_casadi.budget.noise_process import (
     FORCES,
     Matrix,
@@ -297,6 +297,11 @@ class BudgetFigures:
         """The largest of any source."""
         return max(item.disagreement for item in self.sources)
 
+    @property
+    def by_integral(self) -> bool:
+        """Whether that counts for a source, where Lyapunov's equation has no digits."""
+        return any(distrusted(item.disagreement) for item in self.sources if item.source.shaped)
+
 
 def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
     """Evaluate the budget of a loop in SI, plant without feedthrough.
@@ -351,8 +356,11 @@ def _figures(loop: Loop, source: ErrorSource, window: float | None) -> SourceFig
     whole = integrated(loop, source, weight)
     if source.shaped:
         error, average, force = map(float, of_source(loop, source, window))
-        ratio = whole.value[0] / error if error > 0.0 else 1.0
+        ratio = whole.value[0] / error if error != 0.0 else 1.0
         disagreement = abs(float(ratio) - 1.0)
+        if distrusted(disagreement):
+            error, finite, average = map(float, whole.value)
+            force = force if force == np.inf else finite
     else:
         error, force, average = map(float, whole.value)
         average = np.nan if window is None else average

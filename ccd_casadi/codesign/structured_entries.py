@@ -67,8 +67,8 @@ def design_dict(
     ratios, ported = judged.worst, {}
     if loop and loops[0].ported:
         ported = compliance_dict(*compliance_of(loops, problem.inner.omega_low))
-        between = plant_of(problem).between
-        ported["compliance_words"] += f", {between}"
+        if (plant := plant_of(problem)).ports:  # behind an amplifier alone it is the machine's own
+            ported["compliance_words"] += f", {plant.between}"
     return {
         **dict.fromkeys(("omega_S_hz", "omega_T_hz")),
         "outcome": design.outcome.name.lower(),

@@ -294,7 +294,12 @@ def loop_budget(
 
     loops = design_loops(problem, theta, controller)
     model = evaluate_budget(loops[0], problem.budget)
-    found = [variances(loop, problem.budget) for loop in loops]
+    if model is not None and model.by_integral:
+        each = (evaluate_budget(loop, problem.budget) for loop in loops)
+        found = [None if one is None else np.square([one.error, one.average, one.force])
+                 for one in each]  # fmt: skip
+    else:
+        found = [variances(loop, problem.budget) for loop in loops]
     largest = np.max([np.full(3, np.inf) if item is None else item for item in found], axis=0)
     error, force = np.sqrt(largest[[0, 2]]).tolist()
     return LoopBudget(model, len(loops), error, force, problem.sampling is not None)

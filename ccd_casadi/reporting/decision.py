@@ -22,7 +22,6 @@ from ccd_casadi.reporting.concerns import (
     resonance_condition,
     unproven,
 )
-from ccd_casadi.support.time_budget import StageOptions
 
 NEXT = {  # what to do about a line that failed, or about what the decision names
     "certified": "make the run again",
@@ -69,9 +68,12 @@ BOUNDS_KEPT = {
     "optimal": (("optimality", "inner_optimum"), ConcernKind.NOT_OPTIMAL, "it is not the optimum"),
     "predicted": (("prediction",), ConcernKind.MISPREDICTED, "the surrogate mispredicts it"),
 }
-WARNINGS = (
-    Reason.ON_GRID_ALONE, Reason.NOT_CONFIRMED, Reason.NOT_CHALLENGED, Reason.SADDLE,
-    Reason.MISPREDICTED, Reason.EXTRAPOLATES, Reason.LEFT_OUT_TOO_FAR, Reason.BETWEEN_ABOVE,
+WARNINGS = (  # with those that fail `optimal`, which only warn where a budget ended the search
+    Reason.ON_GRID_ALONE, Reason.NOT_CONFIRMED, Reason.ENGINE_UNKNOWN, Reason.NOT_CHALLENGED,
+    Reason.SADDLE, Reason.NO_GRADIENT, Reason.NOT_STATIONARY, Reason.BOUND_EXCEEDED,
+    Reason.KINK_FALLS, Reason.CONTROLLER_BETTER, Reason.WEIGHTS_BETTER, Reason.MISPREDICTED,
+    Reason.EXTRAPOLATES, Reason.LEFT_OUT_TOO_FAR, Reason.SHARE_ALONE, Reason.PEAK_ABOVE,
+    Reason.WEIGHTED_ABOVE, Reason.BETWEEN_ABOVE,
 )  # fmt: skip
 SENTENCES = {
     Build.YES: "Build this.",
@@ -182,8 +184,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
     concerns = [*missed, *weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
-        share, minutes = 100.0 * StageOptions.ending, budget["minutes"]
-        words = f"the search was ended by its {share:g} % of the budget of {minutes:g} min"
+        share = f"{100.0 * budget['share']:.3g} % of the " if "share" in budget else ""
+        words = f"the search was ended by its {share}budget of {budget['minutes']:g} min"
         concerns.append(Concern(ConcernKind.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"
@@ -240,9 +242,11 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
 
 
 def _warning(line: Check) -> Concern:
-    """What a line that warned warns of: among its findings there are good ones too."""
+    """What a line that warned warns of: among its findings there are good ones too, and what is
+    known in part, as of a kink, is its first."""
     of = ConcernKind.MISPREDICTED if line.name == "predicted" else ConcernKind.LINE_WARNED
-    words = [one.words(line.figures) for one in line.findings if one.reason in WARNINGS]
+    known = [one for one in line.findings if one.reason in WARNINGS] or line.findings[:1]
+    words = [one.words(line.figures) for one in known if one.reason is not Reason.QUOTED]
     return Concern(of, "; ".join(words) or f"{line.name} warned")
 
 

@@ -53,11 +53,14 @@ class TimeBudget:
         s of `time.monotonic`, of all processes of a machine.
     left : Counter
         What was not searched, by name: how many.
+    share : float
+        Of the minutes: the largest whose end left something.
     """
 
     minutes: float = math.inf
     began: float = field(default_factory=lambda: time.monotonic())
     left: Counter[str] = field(default_factory=Counter)
+    share: float = 0.0
 
     def until(self, share: float) -> float:
         """The end of a share of it, s of `time.monotonic`."""
@@ -72,7 +75,8 @@ class TimeBudget:
     def entry(self) -> dict[str, object]:
         """Of result.json."""
         minutes = self.minutes if math.isfinite(self.minutes) else None
-        return {"minutes": minutes, "ended": self.ended, "not_searched": dict(self.left)}
+        share = {"share": self.share} if self.ended else {}
+        return {"minutes": minutes, "ended": self.ended, **share, "not_searched": dict(self.left)}
 
 
 _BUDGET: ContextVar[TimeBudget | None] = ContextVar("budget", default=None)
@@ -150,7 +154,9 @@ def not_searched(what: str, count: int = 1) -> None:
     count : int
     """
     if count > 0 and time_is_up():
-        budget().left[what] += count
+        own = budget()
+        own.left[what] += count
+        own.share = max(own.share, (_DEADLINE.get() - own.began) / max(60.0 * own.minutes, 1e-9))
 
 
 def ends_early(what: str, count: int = 1) -> bool:

@@ -72,6 +72,7 @@ def test_stages_end_in_their_order(minutes: float, share: float) -> None:
             not_searched("theta", 3)
             assert own.left == ({"theta": 3} if up else {})
             assert own.ended == up
+            assert own.share == pytest.approx(StageOptions.search if up else 0.0)
     assert not budget().ended
 
 

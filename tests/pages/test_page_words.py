@@ -16,6 +16,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import RobustTable
 from ccd_casadi.codesign.outer_problem import FormulationRound
+from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.deployment.outcome import DeployedRun, against
 from ccd_casadi.deployment.robust_set import MemberLoop
@@ -118,9 +119,11 @@ def test_a_kept_set_with_an_unstable_controller_is_a_question_and_no_refusal() -
 
 def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended = result_of(optimal="unknown") | {"time_budget": {"minutes": 5.0, "ended": True}}
+    assert "accept: the search was ended by its budget of 5 min" in advice(ended)  # an older run
+    ended["time_budget"]["share"] = 0.6
     words = advice(ended)
     assert words.startswith(
-        "Build this only if you accept: the search was ended by its 75 % of the budget of 5"
+        "Build this only if you accept: the search was ended by its 60 % of the budget of 5"
     )
     assert "a larger --budget" in words
     within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
@@ -233,6 +236,35 @@ def test_a_decision_says_what_a_line_warns_of() -> None:
         "prediction and truth differ by 2 %, more than 0.1 %. "
         "Next: retrain, or more points in [sampling]."
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "said"),
+    [
+        ("deployable", [Reason.PEAK_ABOVE(over=2.0, S_max=2.0, excess=0.05, plant=""),
+                        Reason.BETWEEN(between_peak=2.0)],
+         "hold and delay bring the peak of S 2.00 % above S_max = 2; a deployment may exceed it "
+         "by 5 %"),
+        ("deployable", [Reason.WEIGHTED_ABOVE(name="KS", level=1.1)],
+         "|W_KS KS| of the code is 1.1 times weighted_level"),
+        ("deployable", [Reason.JUDGED(words="S between its samples is not judged")],
+         "S between its samples is not judged"),
+        ("optimal", [Reason.NO_GRADIENT(controller_residual=0.1), Reason.GAP_UNKNOWN()],
+         "no gradient over theta, since the search over the controller ended 1.0e-01 from its "
+         "optimum: a limit of the program"),
+        ("optimal", [Reason.BUDGET(minutes=1.0, not_searched={"start": 1}), Reason.LARGER_BUDGET(),
+                     Reason.NOT_STATIONARY(kkt_residual=0.5, kkt_level=0.1)],
+         "not optimal: KKT residual 0.5 over theta, above 0.1"),
+        ("optimal", [Reason.OPTIMAL_AT_KINK(slopes=[[0.2, None]], least_slope=0.2)],
+         "locally optimal to first order at a kink: J rises on the 1 known sides of 2"),
+    ],
+)  # fmt: skip
+def test_every_line_that_warns_has_its_reason_in_the_decision(
+    name: str, found: list[Finding], said: str
+) -> None:
+    result = result_of(**{name: "warned"})
+    result["verdict"][name]["findings"] = [one.entry for one in found]
+    assert advice(result).startswith(f"Build this only if you accept: {said}.")
 
 
 def test_what_s_may_reach_between_two_lines_is_said_first() -> None:

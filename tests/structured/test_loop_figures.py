@@ -143,6 +143,32 @@ def test_what_a_force_moved_decays_with_the_slow_pole(slow: float) -> None:
     assert "decay_seconds" not in held.entry(scalar=True)
 
 
+def test_what_two_axes_that_are_apart_move_of_each_other_by_rounding_does_not_count() -> None:
+    """Two masses along turned axes: the decay is the slower one's of both alone."""
+    c, s = np.cos(0.5), np.sin(0.5)
+    R, one, none = np.array([[c, -s], [s, c]]), np.eye(2), np.zeros((2, 2))
+    inverse = R @ np.diag([0.5, 0.25]) @ R.T
+    A, C = np.block([[none, one], [none, -0.01 * one]]), np.hstack([R.T, none])
+    G = StateSpace(A, np.vstack([none, inverse @ R]), C, none)
+    K = StateSpace(*ss_of_pid([300.0, 8e3, 8e4, 1e3]))
+
+    def both(each: np.ndarray) -> np.ndarray:
+        return np.kron(one, each)
+
+    whole = largest_force_step([Loop(G, StateSpace(*map(both, (K.A, K.B, K.C, K.D))))], 60.0)
+    alone = [largest_force_step([Loop(StateSpace(A[::2, ::2], np.array([[0.0], [1.0 / mass]]),
+                                                 np.eye(1, 2), np.zeros((1, 1))), K)], 60.0).decay
+             for mass in (2.0, 4.0)]  # fmt: skip
+    assert whole.decay == pytest.approx(max(alone), rel=0.05)
+
+
+def ss_of_pid(values: list[float]) -> tuple[np.ndarray, ...]:
+    """A, B, C, D of k_p + k_i/s + k_d s/(s/w + 1) by (k_d, k_p, k_i, w)."""
+    kd, kp, ki, w = values
+    A, B = np.diag([0.0, -w]), np.ones((2, 1))
+    return A, B, np.array([[ki, -kd * w * w]]), np.array([[kp + kd * w]])
+
+
 @pytest.mark.parametrize("sampling", [None, FAST])
 def test_the_error_that_stays_is_that_of_a_long_move(sampling: Sampling | None) -> None:
     """A spring of k and a gain of 3 k: a quarter of the way is left; a free mass: nothing."""

@@ -101,13 +101,15 @@ def sheet_figures(
     """What the design reaches, each figure with its limit; `answer` by `entry`."""
     own, (Kv, _, Tn), of = design.cascade, design.values[:3], problem.problem
     rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
+    ruled = own.allowed(design.values).min() <= design.bandwidth * (1.0 + 1e-9)
+    least = "what decay and filters allow" if ruled else "the least of the plants"
     found = []
     if of.names:
         named = {"theta": named_theta(problem, problem.theta), "units": of.parameter_units}
         found.append(("hardware", theta_words(named)))
     found += [
-        ("bandwidth", f"{rounded:.4g} Hz, the least of the plants; {free:.4g} Hz before rounding, "
-         "on fewer"),
+        ("bandwidth", f"{rounded:.4g} Hz, {least}; {free:.4g} Hz before rounding, "
+         "on fewer plants"),
         ("peaks of S", _peaks(problem, design)),
         *((f"margins at {one['place']}", _margin_words(one)) for one in answer.get("margins", ())),
     ]  # fmt: skip
