@@ -38,11 +38,13 @@ def summary(solution: "Solution") -> str:
     words = template("templates/solve.txt", gain_words=gain_words, channel_words=channel_words)
     if r["status"] == "infeasible":
         return words.render(r=r).rstrip()
-    sections: list[Any] = []
+    sections: list[str] = []
     if found := r.get("controller", {}).get("sections"):
-        from ccd_casadi.inner_problem.sections_words import SectionWords
+        from ccd_casadi.inner_problem.sections_words import SectionWords, sampled_words
 
-        sections = [SectionWords(**item) for item in found]
+        made = [SectionWords(**item) for item in found]
+        moved = sampled_words(made, r["verdict"]["deployable"].get("rate_hz"))
+        sections = [*(item.text for item in made), *filter(None, [moved])]
     return words.render(
         r=r, decision=advice(r), verdict=terminal_lines(r), details=detail_lines(r),
         theta=theta_words(r), hardware=cost_words(r, 6), inner_value=inner_value_lines(r),

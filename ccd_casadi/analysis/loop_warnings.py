@@ -226,8 +226,8 @@ def loop_warnings(
         )
     if again is not None:
         words.append(
-            f"|L| exceeds 1 again from {again.low / HZ:.4g} to {again.high / HZ:.4g} Hz, by "
-            f"{again.peak:.3g} at most: the controller raises it, by a light pole of its own or "
-            "where the plant has no resonance"
+            f"|L| exceeds 1 again from {again.low / HZ:.4g} to {again.high / HZ:.4g} Hz, and is "
+            f"{again.peak:.3g} there at most: the controller raises it, by a light pole of its own "
+            "or where the plant has no resonance"
         )
     return words

@@ -132,7 +132,7 @@ def diagnose(
             here += [
                 *driven_away_findings(found, modal.states is not None, place),
                 *hidden_findings(modal, place, options),
-                *zero_findings(found, problem.inner.S_max, place),
+                *zero_findings(problem, found, place),
             ]
             if index == 0:
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)

@@ -51,15 +51,22 @@ STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, 
 
 
 def zero_findings(
-    facts: PlantFacts, S_max: float, place: str, *, options: FindingOptions = FindingOptions()
+    problem: CoDesignProblem,
+    facts: PlantFacts,
+    place: str,
+    *,
+    options: FindingOptions = FindingOptions(),
 ) -> list[CaseFinding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
     right = [zero for zero in facts.zeros if zero.damping_ratio < 0.0]
     if right:
-        found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
+        nearest = min(right, key=lambda z: z.frequency_hz)
+        found.append(_right(nearest, facts, problem.inner.S_max, place))
     return found + [
-        _dip(zero, place) for zero in facts.zeros if 0.0 <= zero.damping_ratio < options.light
+        _dip(zero, place, states_effort(problem))
+        for zero in facts.zeros
+        if 0.0 <= zero.damping_ratio < options.light
     ]
 
 
@@ -75,15 +82,15 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> CaseFindi
     return CaseFinding(severity, Topic.ZERO, words, limit_hz=limit)
 
 
-def _dip(zero: Zero, place: str) -> CaseFinding:
+def _dip(zero: Zero, place: str, effort: bool) -> CaseFinding:
     words = f"an anti-resonance (transmission zero) at {zero.frequency_hz:.4g} Hz {place}, "
     if zero.dip < FindingOptions.blind:
         words += "undamped, caps the bandwidth there: no force moves the sensor at it"
     else:
         words += (
-            f"damping {100 * zero.damping_ratio:.2g} %, caps the bandwidth there: control through "
-            f"it needs {1.0 / zero.dip:.2g} times the force; raise M_K if the actuator can give it"
-        )
+            f"damping {100 * zero.damping_ratio:.2g} %: |G| dips there, so a bandwidth just above "
+            f"it needs {float(f'{1.0 / zero.dip:.2g}'):g} times the gain"
+        ) + ("; raise M_K if the actuator can give it" if effort else "")
     return CaseFinding(Severity.NOTE, Topic.ZERO, words)
 
 

@@ -1,5 +1,6 @@
 """A controller of fixed structure as a motion engineer reads it: sections in Hz and damping."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -82,6 +83,42 @@ def _biquad(zero: float, pole: float, zero_damping: float, pole_damping: float) 
     if max(zero / pole, pole / zero) <= 1.1:  # of nearly one frequency
         return "notch" if zero_damping < pole_damping else "resonance filter"
     return "skewed notch, lead" if zero < pole else "skewed notch, lag"
+
+
+def sampled_words(
+    sections: Sequence[SectionWords], rate_hz: float | None, *, least: float = 0.02
+) -> str:
+    """Write where the fastest root acts in the sampled controller.
+
+    Tustin's rule takes s = 2/T (z - 1)/(z + 1), so that what K has at f K(z) has at
+
+        f' = atan(π f T) / (π T)
+
+    Parameters
+    ----------
+    sections : sequence of SectionWords
+    rate_hz : float or None
+        1/T in Hz; None of a continuous loop.
+    least : float
+        Share of a frequency by which it moves, below which nothing is written.
+
+    Returns
+    -------
+    str
+        Empty of a continuous loop, and where no root moves by `least`.
+
+    Examples
+    --------
+    >>> sampled_words([SectionWords("roll-off", pole_hz=1000.0 / np.pi)], 1000.0)
+    "at 1000 Hz Tustin's rule takes 318.3 Hz to 250 Hz"
+    """
+    fastest = max((hz for item in sections for hz in (item.zero_hz, item.pole_hz) if hz), default=0)
+    if rate_hz is None or not fastest:
+        return ""
+    acts = float(np.arctan(np.pi * fastest / rate_hz)) * rate_hz / np.pi
+    if acts > (1.0 - least) * fastest:
+        return ""
+    return f"at {rate_hz:g} Hz Tustin's rule takes {fastest:.4g} Hz to {acts:.4g} Hz"
 
 
 def gain_of(kappa: Array) -> float:

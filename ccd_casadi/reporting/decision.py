@@ -34,7 +34,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which resumes this search",
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
-    "loop": "a smaller S_max; with sections bandwidth_least_hz, least_damping or weighted_level",
+    "loop": "with sections least_damping, weighted_level or bandwidth_least_hz; a smaller S_max",
 }
 
 

@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
-from ccd_casadi.inner_problem.sections_words import SectionWords
+from ccd_casadi.inner_problem.sections_words import SectionWords, sampled_words
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.plant import hardware_cost
@@ -116,7 +116,7 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     Parameters
     ----------
     result : mapping
-        Only `controller` is read.
+        Only `controller` is read, and the rate of the verdict.
 
     Returns
     -------
@@ -124,7 +124,9 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
-    words = paragraph("report.sections", controller, gain_words(controller))
+    deployable = result.get("verdict", {}).get("deployable", {})
+    moved = sampled_words(found, deployable.get("rate_hz"))
+    words = paragraph("report.sections", controller, gain_words(controller), moved)
     return Words(words), structured_table(found)
 
 

@@ -320,6 +320,19 @@ def test_the_proven_limit_is_poissons_integral(damping: float) -> None:
 SECTIONS = '\n[controller]\nstructure = "sections"\nbiquads = 0\nweighted_level = 9.0\n'
 
 
+def test_a_dip_names_M_K_only_where_the_case_states_one(tmp_path: Path) -> None:
+    """Sections without weighted_level have no M_K; a loop far above the zero crosses the dip."""
+    case = case_file(tmp_path, GOOD.replace("2e8", "2e7"))
+    before = case.read_text()
+    for level, named in (("weighted_level = 9.0\n", True), ("", False)):
+        case.write_text(before + SECTIONS.replace("weighted_level = 9.0\n", level))
+        (words,) = [
+            f.words for f in diagnose(problem_of(load_case(case)))[1] if f.topic is Topic.ZERO
+        ][:1]
+        assert ("raise M_K" in words) is named
+        assert "e+" not in words
+
+
 @pytest.mark.parametrize(
     ("more", "loop", "words"),
     [

@@ -158,6 +158,8 @@ def test_behind_a_screw_a_gain_is_in_the_unit_of_the_rotary_motor() -> None:
     assert named == given
     assert [own.unit for own in named.settings[:3]] == ["1000/min", "N m s/rad", "ms"]
     assert linear.settings[1].unit == "N s/m"
+    assert linear.drive.travel is None
+    assert named.drive.travel == pytest.approx(16e-3 / (2.0 * np.pi))
     travel, omega = 16e-3 / (2.0 * np.pi), 7.0
     Kp = named.settings[1].rounded(4e5)  # N s/m
     torque = Kp * omega * travel * travel

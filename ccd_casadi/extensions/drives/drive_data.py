@@ -224,6 +224,8 @@ class Drive:
         Gain of the current controller in V/A, and its integral time in s.
     sources, chosen, unknown : tuple of str
         What manuals say, what is this file's choice, and what no manual was found for.
+    travel : float or None
+        Of the axis by a turn of a rotary motor, m/rad.
     """
 
     title: str
@@ -241,6 +243,7 @@ class Drive:
     force_feedforward: Setting | None = None
     current: Setting | None = None
     current_integral: Setting | None = None
+    travel: float | None = None
 
     def places(self, place: str) -> tuple[Slot, ...]:
         """Its filters at a place."""
@@ -256,7 +259,7 @@ class Drive:
         }
         if not all(own.unit for own in turned.values()):
             raise UserError(f"{self.title} has no units of a rotary motor; drop lead_mm")
-        return replace(self, **turned)
+        return replace(self, travel=travel, **turned)
 
 
 PLACES = ("current", "setpoint")

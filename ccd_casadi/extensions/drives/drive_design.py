@@ -198,7 +198,7 @@ def design_drive(
         if moved is not None and bounds.compliance_max is not None:
             judged = with_compliance(judged, moved, bounds.compliance_max)
         band = float(np.fmin(judged.bandwidth, rounded.bandwidth))
-        progress(f"{band / HZ:.4g} Hz on the drive's grid; proving it on the whole set")
+        progress(f"{band / HZ:.4g} Hz on the drive's grid; proof on the whole set")
         proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
         for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
             if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):

@@ -115,8 +115,8 @@ def sheet_figures(
     ]  # fmt: skip
     if design.compliance is not None:
         until = "" if np.isinf(own.stiff_below) else f" up to {own.stiff_below / HZ:.4g} Hz"
-        found.append(("compliance", f"at most {design.compliance:.4g} m/N{until} on the judged "
-                      "plants"))  # fmt: skip
+        most = with_unit(design.compliance, "/".join(of.spoken[:2]), 4)
+        found.append(("compliance", f"at most {most}{until} on the judged plants"))
     lowest = design.values[own.hertz].min(initial=np.inf) / rounded
     found.append(("filters", f"raise their gain to {design.rise:.4g} of rest, limit "
                   f"{own.filter_gain:.4g}; lowest at {lowest:.4g} of ω_b, at least "
@@ -125,8 +125,10 @@ def sheet_figures(
         float(design.controller.D[0, own.velocity])
     )  # the difference, PI and filters at once
     motor = place_name(problem.bounds, own.velocity)
+    turned = own.drive.travel
+    torque = "" if turned is None else f", {with_unit(1e-9 * step * turned, 'N m')} at the motor"
     found.append(("encoder", f"a step of 1 n{of.spoken[0]} at {motor} changes the force by "
-                  f"{with_unit(1e-9 * step, of.spoken[1])}"))  # fmt: skip
+                  f"{with_unit(1e-9 * step, of.spoken[1])}{torque}"))  # fmt: skip
     found.append(("decay", f"ω_b Tn {design.bandwidth * Tn:.4g}, ω_b/Kv "
                   f"{design.bandwidth / Kv:.4g}; limit {own.decay:.4g}"))  # fmt: skip
     if (moved := answer["following_error"]) is not None:
