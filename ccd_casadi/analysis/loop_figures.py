@@ -207,21 +207,22 @@ def largest_force_step(
     ForceStep
         Until the loop is at rest.
     """
-    found, decay = [], 0.0
+    found = []
     for plant, loop in enumerate(loops):
         times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
         each = np.abs(y).max(axis=2, keepdims=True)
         left = np.abs(y) > np.maximum(options.decayed * each, options.coupled * each.max(axis=0))
         last = int(np.flatnonzero(left.any(axis=(0, 1)))[-1])
-        decay = max(decay, float(times[last]) if last + 1 < len(times) else np.inf)
+        decay = float(times[last]) if last + 1 < len(times) else np.inf
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
         moved = f"{loop.names[0]} {output + 1}"
         if loop.at and loop.names[0] == Loop.names[0]:
             moved = f"channel {loop.at[0].name}"  # whose error counts
         names = moved, f"{loop.names[1]} {actuator + 1}"
-        found.append(ForceStep(0.0, size, float(times[k]), output, actuator, plant, names))
-    return replace(max(found, key=lambda step: step.size), decay=decay)
+        found.append(ForceStep(decay, size, float(times[k]), output, actuator, plant, names))
+    largest = max(found, key=lambda step: step.size)
+    return replace(largest, decay=max(step.decay for step in found))
 
 
 def compliance_of(loops: Sequence[Loop], omega_low: float) -> tuple[float, float, float, float]:
