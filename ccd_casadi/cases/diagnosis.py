@@ -22,6 +22,7 @@ from ccd_casadi.cases.findings import (
 )
 from ccd_casadi.cases.plant_findings import (
     DiagnosisOptions,
+    controller_findings,
     driven_away_findings,
     entry_findings,
     hidden_findings,
@@ -137,7 +138,8 @@ def diagnose(
             if index == 0:
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
                 here += plausibility_findings(problem, found)
-                here += loop_findings(problem, found, modal) + _unused(problem, plant, system)
+                here += loop_findings(problem, found, modal) + controller_findings(problem)
+                here += _unused(problem, plant, system)
             findings += [replace(item, index=index) for item in here]
             facts.append(found)
         progress.advance()

@@ -83,6 +83,7 @@ class Topic(StrEnum):
     UNITS = "units"
     DERIVATIVES = "derivatives"
     LOOP = "loop"
+    CONTROLLER = "controller"
     UNUSED = "unused parameter"
     UNSTABLE = "unstable pole"
 

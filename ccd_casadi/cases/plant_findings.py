@@ -13,6 +13,7 @@ from ccd_casadi.cases.findings import (
     Topic,
     states_effort,
 )
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
@@ -117,6 +118,35 @@ def loop_findings(
         words += _lag_words(run, meant, options)
         words += _unstable_words(run, growth, problem.inner.S_max)
     return [CaseFinding(Severity.WARNING, Topic.LOOP, item) for item in words]
+
+
+def controller_findings(problem: CoDesignProblem) -> list[CaseFinding]:
+    """Notes of what a search may choose for sections since no bound of the case forbids it.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    list of CaseFinding
+        Empty for other controllers.
+    """
+    controller, words = problem.controller, []
+    if not isinstance(controller, StructuredProblem):
+        return []
+    structures = [one.structure for one in (controller, *controller.channels)]
+    if any(one.biquads and not one.least_damping for one in structures):
+        words.append(
+            "controller.least_damping is not given: a notch of K may be as narrow as a damping "
+            f"ratio of {Structure.dampings[0]:g} allows, which few machines keep; 0.05 suits most"
+        )
+    if any(one.integrator and not one.slowest_zero_hz for one in structures):
+        words.append(
+            "controller.slowest_zero_hz is not given: what a force moved may take seconds to "
+            "decay; 2 Hz cost 4 % of the bandwidth of 47 Hz on a shipped case"
+        )
+    return [CaseFinding(Severity.NOTE, Topic.CONTROLLER, item) for item in words]
 
 
 def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:

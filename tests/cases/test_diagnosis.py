@@ -11,7 +11,7 @@ from ccd_casadi.__main__ import main as ccd
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.findings import Topic
+from ccd_casadi.cases.findings import Severity, Topic
 from ccd_casadi.check import main as check
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.solve import main as solve
@@ -357,6 +357,26 @@ def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
              if item.topic is Topic.LOOP]  # fmt: skip
     assert len(found) == bool(words)
     assert words in " ".join(found)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("biquads = 2\n", ["least_damping is not given", "slowest_zero_hz is not given"]),
+        ("biquads = 2\nleast_damping = 0.05\n", ["slowest_zero_hz is not given"]),
+        ("biquads = 0\nslowest_zero_hz = 2.0\n", []),
+    ],
+)
+def test_what_no_bound_of_sections_forbids_is_noted_before_a_search(
+    tmp_path: Path, keys: str, words: list[str]
+) -> None:
+    path = case_file(tmp_path, GOOD)
+    path.write_text(path.read_text() + SECTIONS.replace("biquads = 0\n", keys))
+    found = [item for item in diagnose(problem_of(load_case(path)))[1]
+             if item.topic is Topic.CONTROLLER]  # fmt: skip
+    assert all(item.severity is Severity.NOTE for item in found)
+    assert len(found) == len(words)
+    assert all(part in item.words for part, item in zip(words, found, strict=True))
 
 
 @pytest.mark.parametrize(
