@@ -135,7 +135,7 @@ def controller_findings(problem: CoDesignProblem) -> list[CaseFinding]:
     controller, words = problem.controller, []
     if not isinstance(controller, StructuredProblem):
         return []
-    structures = [one.structure for one in (controller, *controller.channels)]
+    structures = [controller.structure, *(one.structure for one in controller.channels)]
     if any(one.biquads and not one.least_damping for one in structures):
         words.append(
             "controller.least_damping is not given: a notch of K may be as narrow as a damping "
