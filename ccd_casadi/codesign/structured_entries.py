@@ -203,7 +203,7 @@ def proof_dict(proof: "Proof") -> dict[str, Any]:
         found |= {
             "option": proof.option,
             "point": list(proof.point),
-            "passed": [key_words(proof.passed[0]), proof.passed[1]],
+            "passed": [key_words(proof.exceeded[0]), proof.exceeded[1]],
         }
     return found
 

@@ -237,9 +237,9 @@ class Proof:
         By kind of bound.
     boxes : int
         Boxes that were enclosed.
-    option, point, passed : int, tuple of float, (str, float)
-        Of a refuted box: where, the bound that it passes there (exceeds) and the least factor by
-        which, by an enclosure and not by a sample.
+    option, point, exceeded : int, tuple of float, (str, float)
+        Of a refuted box: where, the bound that it exceeds there and the least factor by which, by
+        an enclosure and not by a sample.
     left : str
         Which bounds the proof is not of, in words; empty: of every bound.
     """
@@ -251,7 +251,7 @@ class Proof:
     boxes: int = 0
     option: int = 0
     point: tuple[float, ...] = ()
-    passed: tuple[str, float] = ("", np.nan)
+    exceeded: tuple[str, float] = ("", np.nan)
     left: str = ""
 
     @property
@@ -304,7 +304,7 @@ class Proof:
         """The outcome, its levels, and what the proof is not of."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
-            name, factor = key_words(self.passed[0]), self.passed[1]
+            name, factor = key_words(self.exceeded[0]), self.exceeded[1]
             return f"a plant of the set exceeds {name} by a factor of {factor:.4g}", f"at {at}"
         if self.outcome is ProofOutcome.UNSTABLE:
             return (f"the proof denies it: {self.outcome.value}",)

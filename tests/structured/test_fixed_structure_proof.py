@@ -84,7 +84,7 @@ def test_a_box_with_a_plant_that_fails_is_refuted_at_a_plant_that_fails(sampling
     proof = prove(BOX, STRUCTURE, KAPPA, bandwidth, bounds, sampling)
     assert proof.outcome is ProofOutcome.REFUTED
     worst = figures(sampling, [(proof.option, np.array(proof.point))], bounds)
-    name, factor = proof.passed
+    name, factor = proof.exceeded
     if name in ("SHAPE", "LEVEL"):
         assert worst["bandwidth"] < bandwidth
     else:

@@ -85,9 +85,9 @@ def test_a_bound_that_a_plant_exceeds_is_refuted_at_such_a_plant() -> None:
     bounds = replace(BARE, S_max=0.98 * peak(drawn(1), LATE))
     proof = prove(BOX, BOTH, KAPPA, 1.0, bounds, LATE, slack=1e-3)
     assert proof.outcome is ProofOutcome.REFUTED
-    assert proof.passed[0] == "S_MAX"
+    assert proof.exceeded[0] == "S_MAX"
     own = peak([(0, np.array(proof.point))], LATE)
-    assert own >= proof.passed[1] * bounds.S_max * (1.0 - 1e-9)
+    assert own >= proof.exceeded[1] * bounds.S_max * (1.0 - 1e-9)
 
 
 def test_an_unstable_plant_of_the_box_is_never_proven() -> None:

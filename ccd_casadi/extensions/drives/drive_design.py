@@ -201,7 +201,7 @@ def design_drive(
         progress(f"{band / HZ:.4g} Hz on the drive's grid; proof on the whole set")
         proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
         for _ in range(options.lowered):  # ω_b is the least of the set, not of some plants
-            if not proof.refuted or proof.passed[0] not in ("SHAPE", "LEVEL"):
+            if not proof.refuted or proof.exceeded[0] not in ("SHAPE", "LEVEL"):
                 break
             band *= 1.0 - options.lower
             proof = prove_cascade(cascade, rounded.values, band, uncertain, of_S, sampling)
