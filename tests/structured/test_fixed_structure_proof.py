@@ -206,7 +206,7 @@ def test_words_name_a_bound_as_a_reader_knows_it(curve: LoopCurve) -> None:
     known = ("weighted_level of KS", "weighted_level of T")
     for row in (curve.name, f"{curve.name} of tilt"):
         proof = Proof(ProofOutcome.OPEN, 1e-3, ("damping",), {row: 1.03}, point=(0.5,),
-                      passed=(row, 1.03))  # fmt: skip
+                      exceeded=(row, 1.03))  # fmt: skip
         said = [replace(proof, outcome=outcome).words for outcome in ProofOutcome]
         said += [BOUNDS.missed(row, 1.41), key_words(row), *bound_words([row])]
         for words in said:
