@@ -22,6 +22,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import UserError
 
+# Constraints of a motor: the share of what it allows, less 1.
+MOTOR_LIMITS = {"peak force": "peak_share", "motor power": "heat_share"}
+
 
 @dataclass(frozen=True)
 class MotionOptions:
@@ -33,6 +36,10 @@ class MotionOptions:
         Along the imaginary axis: derivatives of analytic functions, exact to rounding.
     spring : float
         Of the moving force: a plant that holds its output by more has a spring.
+    nodes : int
+        Of Gauss and Legendre in each interval of a setpoint: exact for squares of forces.
+    shares : int
+        Instants in each interval, of which the nearest to a peak force begins Newton's step.
     instants : int
         Of a continuous move, at which its feedforward is examined.
     beside : float
@@ -41,6 +48,8 @@ class MotionOptions:
 
     complex_step: float = 1e-30
     spring: float = 1e-6
+    nodes: int = 5
+    shares: int = 17
     instants: int = 2000
     beside: float = 1e-9
 
@@ -128,8 +137,12 @@ class Cycle:
     limits: tuple[str, ...] = ()
 
 
-def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
-    """The cycle of a motion within what its motor allows.
+def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | None = None) -> Cycle:
+    """Compute the cycle of a motion within what its motor allows.
+
+    Of free bodies F = g r̈. Where springs or magnets hold the output, F = h r + g r̈: the cycle
+    leads from the place without force, r = 0, to `distance`, and back after a dwell. The way back
+    has the forces of the way there in reverse order, since r(t) + r(T - t) = `distance`.
 
     Parameters
     ----------
@@ -139,12 +152,24 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
         g per unit acceleration, kg.
     mass : float
         Moving mass of the motor, kg; complex for derivatives.
+    holding : (m,) array, optional
+        h per unit of the position, N/m.
 
     Returns
     -------
     Cycle
         With the largest acceleration.
+
+    Raises
+    ------
+    UserError
+        The output is held, and the motor is to find the acceleration.
     """
+    if holding is not None:
+        if not motion.required:
+            words = "is missing: a spring or a magnet holds the output, whose force the motor needs"
+            raise UserError(f"move.acceleration: {words} besides; give it")
+        return _held(motion, forces, mass, holding)
     allowed, motor = motion.limits, motion.motor
     acceleration, why = allowed.acceleration, "acceleration"
     if motor is not None and not motion.required:
@@ -160,6 +185,44 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
     )
     limits = tuple(name for name, value, most in reached if np.real(value / most) > 1.0 - 1e-9)
     return replace(found, limits=limits)
+
+
+def _held(
+    motion: Motion, forces: Array, mass: Any, holding: Array,
+    options: MotionOptions = MotionOptions(),
+) -> Cycle:  # fmt: skip
+    """Compute the cycle of an output that is held with h per unit of the position."""
+    free = replace(motion, motor=None)
+    found = cycle_of(free, forces)
+    profile, far = found.profile, motion.limits.stroke
+    x, weights = np.polynomial.legendre.leggauss(options.nodes)
+    r, _, a, *_ = profile.inside(0.5 * (1.0 + x))
+    squares = (holding[:, None, None] * r + forces[:, None, None] * a) ** 2
+    there = (squares @ (0.5 * weights)) @ profile.durations
+    rest = 0.5 * motion.dwell * (holding * far) ** 2  # at `distance`: every second dwell
+    mean = (there + rest) / (profile.durations.sum() + motion.dwell)
+    peaks = [_peak(profile, h, g, far, options) for h, g in zip(holding, forces, strict=True)]
+    found = replace(found, peak_force=_largest(np.array(peaks)),
+                    rms_force=_largest(mean) ** 0.5)  # fmt: skip
+    if motion.motor is None:
+        return found
+    k, R, i_peak = motion.motor.at(mass)
+    power = R / k**2 * mean.sum()
+    return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
+                   heat_share=power / (motion.motor.rms_power or np.inf))  # fmt: skip
+
+
+def _peak(profile: Setpoint, h: Any, g: Any, far: float, options: MotionOptions) -> Any:
+    """Find the largest |h r + g r̈| of a move, or |h| `far` at rest, by Newton's step to f' = 0."""
+    shares = np.linspace(0.0, 1.0, options.shares)
+    r, v, a, j, s = profile.inside(shares).real
+    f, slope, bend = (np.real(h) * x + np.real(g) * y for x, y in ((r, a), (v, j), (a, s)))
+    size = np.maximum(profile.durations.real, 1e-300)[:, None]
+    step = np.divide(-slope, bend * size, out=np.zeros_like(f), where=bend != 0.0)
+    near = np.clip(shares + np.clip(step, -shares[1], shares[1]), 0.0, 1.0)
+    r, _, a, *_ = profile.inside(near)
+    found = np.append((h * r + g * a).ravel(), h * far)
+    return found[np.abs(np.real(found)).argmax()]
 
 
 def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
@@ -213,6 +276,8 @@ class MotionAt:
         Its cycle, and those with each parameter a step along the imaginary axis away.
     forward, forward_slopes : (5, m), (n_θ, 5, m) array
         Feedforward per derivative of the setpoint, and its derivatives to θ.
+    held : bool
+        Whether a spring or a magnet holds the output, so that the cycle counts `forward[0]`.
     """
 
     motion: Motion
@@ -221,6 +286,12 @@ class MotionAt:
     stepped: tuple[Cycle, ...]
     forward: Array
     forward_slopes: Array
+    held: bool = False
+
+    def body_forces(self, r: Array) -> Array:
+        """The forces (N, m) of a setpoint (5, N) that the cycle counts: g r̈, and h r if held."""
+        forces = np.outer(r[2], self.forward[2])
+        return forces + np.outer(r[0], self.forward[0]) if self.held else forces
 
     def forward_force(self, sampling: Sampling | None) -> float:
         """The largest force of the feedforward on any motor, with all its terms.
@@ -258,21 +329,22 @@ def motion_at(
 ) -> MotionAt:  # fmt: skip
     """Of a plant with its rigid bodies free, square; `mass` of the motor is parameter `place` of θ.
 
-    Raises UserError where a spring holds the output.
+    Raises UserError where the output is held and no acceleration is given.
     """
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
     ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
     found = cycle_of(motion, ahead[2], mass)
-    if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
-        words = "a spring holds the output that moves, and its force is not counted"
-        raise UserError(f"move: {words}; drop [move], and give `ccd robustness` the stroke")
+    held = np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force
+    if held:
+        found = cycle_of(motion, ahead[2], mass, ahead[0])
     step = 1j * options.complex_step
     stepped = tuple(
-        cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place))
+        cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place),
+                 ahead[0] + step * slope[0] if held else None)
         for i, slope in enumerate(slopes)
-    )
-    return MotionAt(motion, mass, found, stepped, ahead, slopes)
+    )  # fmt: skip
+    return MotionAt(motion, mass, found, stepped, ahead, slopes, bool(held))
 
 
 class DrivenMechanics:
@@ -325,7 +397,7 @@ class DrivenMechanics:
         return replace(found, M=found.M + m * B @ B.T, derivatives=(dM, dD, dK, dB, dC))
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
-        """The move at θ. Raises UserError where a spring holds the output."""
+        """The move at θ. Raises UserError as `motion_at`."""
         found, row = self(theta), np.array([self.motion.output])
         if self.motion.output:
             own = (*found.derivatives[:4], row @ found.derivatives[4])
@@ -389,14 +461,14 @@ def _hardware(
     """(f, λ) of the plant and its motors, and the names of the motors' constraints."""
     theta, motor = ca.MX.sym("theta", len(names)), own.motion.motor
     f, lam = plant.hardware(ca.vertcat(*(theta[i] for i in range(len(names)) if i != own.place)))
-    limits: dict[str, str] = {}
+    limits: list[str] = []
     if motor is not None and own.motion.required:
-        limits = {"peak force": "peak_share"} if motor.peak_current[0] < Motor.unlimited else {}
-        limits |= {} if motor.rms_power is None else {"motor power": "heat_share"}
+        bounded = (motor.peak_current[0] < Motor.unlimited, motor.rms_power is not None)
+        limits = [name for name, there in zip(MOTOR_LIMITS, bounded, strict=True) if there]
     if not limits:
         return ca.Function("hardware", [theta], [f, lam]), []
     at = lru_cache(maxsize=64)(own.at)  # f and λ of one θ, and slopes
-    figures = [attrgetter(name) for name in limits.values()]
+    figures = [attrgetter(MOTOR_LIMITS[name]) for name in limits]
 
     def values(x: Array) -> Array:
         return np.array([np.real(read(at(tuple(x.tolist())).cycle)) - 1.0 for read in figures])
@@ -406,4 +478,4 @@ def _hardware(
 
     own.keep = VectorCallback("motors", len(names), len(limits), values, slopes)
     lam = ca.vertcat(lam, own.keep(theta))
-    return ca.Function("hardware", [theta], [f, lam]), list(limits)
+    return ca.Function("hardware", [theta], [f, lam]), limits

@@ -51,6 +51,14 @@ class Setpoint:
         start[-1, 1:] = 0.0  # what rounding left
         return start
 
+    def inside(self, shares: Array) -> Array:
+        """r and four derivatives (5, 15, k) at shares of each interval, (k,) or (15, k).
+
+        Analytic in the durations and snaps, which may be complex.
+        """
+        start, snaps = self._starts()[:-1].T[:, :, None], self.snaps[:, None]
+        return _advanced(start, snaps, self.durations[:, None] * np.atleast_2d(shares))
+
     def at(self, times: Array) -> Array:
         """r, ṙ, r̈, r⃛ and r⁗ (5, k) at times in s, at rest before the start and after the end."""
         ends = np.concatenate([[0.0], np.cumsum(self.durations)])
@@ -63,7 +71,7 @@ class Setpoint:
 
 
 def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
-    """r and four derivatives (5, k) a time t after `state` (4, ...), with a constant snap."""
+    """r and four derivatives (5, ...) a time t after `state` (4, ...), with a constant snap."""
     r, v, a, j = state
     rows = (
         r + t * (v + t * (a / 2 + t * (j / 6 + t * snap / 24))),

@@ -331,7 +331,7 @@ def _move_words(
         profile = motion_of(problem, problem.start).cycle.profile
         made["acceleration"] = float(np.real(profile.acceleration))
         seconds = profile.duration
-    except UserError:  # such as of a spring: what makes the move reports it
+    except UserError:  # such as of a held output: what makes the move reports it
         pass
     for key, value, limit, unit in (
         ("distance", limits.stroke, most.stroke, "m"),

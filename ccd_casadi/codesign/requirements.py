@@ -11,6 +11,7 @@ from enum import StrEnum
 from math import isfinite, nan
 from typing import Any
 
+from ccd_casadi.analysis.motor import MOTOR_LIMITS
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
@@ -50,7 +51,8 @@ class Requirement:
     required, achieved : float
         In the unit of the key, `achieved` NaN where it is not known.
     margin : float
-        See the head of the module; of a constraint λ <= 0 it is -λ over its range.
+        See the head of the module; of a constraint λ <= 0 it is -λ over its range, of a motor's
+        limit the share of it that is left.
     plant : str
         Where the figure is largest; empty of one plant.
     frequency_hz : float
@@ -118,7 +120,8 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
     plant = plant_of(problem)
     values, sizes = constraint_values(plant, verified.theta), constraint_sizes(problem)
     for name, value, size in zip(plant.constraint_names, values, sizes, strict=True):
-        margin = -float(value) / float(size)
+        of_motor = problem.source.motion is not None and name in MOTOR_LIMITS
+        margin = -float(value) / (1.0 if of_motor else float(size))
         found.append(Requirement(name, 0.0, float(value), margin, "", nan, Evidence.JUDGED))
     return tuple(found)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import UndefinedError
 
+from ccd_casadi.analysis.motor import MOTOR_LIMITS
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -160,9 +161,10 @@ def requirements_table(result: Mapping[str, Any]) -> Table:
 def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for one in result.get("requirements", ()):
         margin = one["margin"]
+        of_lambda = one["required"] == 0.0 and one["name"] not in MOTOR_LIMITS
+        known = "not known" if margin is None else f"{round(100.0 * margin, 2) + 0.0:.2f} %"
         yield (
-            one["name"], *requirement_words(one),
-            "not known" if margin is None else f"{round(100.0 * margin, 2) + 0.0:.2f} %",
+            one["name"], *requirement_words(one), known + " of its range" * of_lambda,
             requirement_place(one), one["evidence"],
         )  # fmt: skip
 

@@ -111,13 +111,13 @@ def cycle_chapter(
     from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 
     found, motor = motion_of(problem, theta), own.motor
-    profile, forces, settled = found.cycle.profile, found.forward[2], shown["settled_latest"]
+    profile, settled = found.cycle.profile, shown["settled_latest"]
     k, R, _ = motor.at(found.mass)
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
-    force = profile.at(time).T @ found.forward
-    if problem.source.wiring.actuator:  # of whose command all but this makes up for its lag
-        force = np.outer(profile.at(time)[2], forces)
-    heat = R / k**2 * (np.outer(profile.at(time)[2], forces) ** 2).sum(axis=1)
+    r = profile.at(time)
+    bodies = found.body_forces(r)  # behind an actuator the rest makes up for its lag
+    force = bodies if problem.source.wiring.actuator else r.T @ found.forward
+    heat = R / k**2 * (bodies**2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(shown["power"], "mean")
     ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration
@@ -129,14 +129,14 @@ def cycle_chapter(
     if not own.required:
         watts = shown["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
-        times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
+        times = [cycle_of(each, found.forward[2], found.mass).profile.duration for each in limited]
         curve = c.Curve(watts, 1e3 * (np.array(times) + late))
         here = c.Level(shown["power"], "this design", vertical=True)
         panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
                               levels=(here,)))  # fmt: skip
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
-    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required)
+    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, found.held)
     words = paragraph("report.cycle", shown, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from oracles import random_moves as moves
@@ -13,6 +14,7 @@ from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.motor import Motion, MotionAt, MotionOptions, Motor, cycle_of, with_motion
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_time import _Crossing
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.result_entries import move_entry
@@ -33,6 +35,7 @@ from ccd_casadi.plants.plant import (
 )
 from ccd_casadi.reporting.concerns import current_concern
 from ccd_casadi.reporting.decision import advice
+from ccd_casadi.support.errors import UserError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
@@ -170,6 +173,55 @@ def test_the_motor_on_the_plant() -> None:
     dM = mechanics(driven, theta).derivatives[0]
     numeric = slopes(lambda s: mechanics(driven, s * theta).M.ravel(), np.ones(3), 1e-3)
     assert (dM.reshape(3, -1).T * theta) == pytest.approx(numeric, abs=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [4e3, 50.0, -3e3])
+def test_the_force_that_holds_an_output_counts_in_its_cycle(stiffness: float) -> None:
+    """There and back over a spring or a magnet, against sums over 200,000 instants."""
+    limits, mass, dwell = MoveLimits(0.01, 0.2, 5.0, 1e3, 1e6), 3.0, 0.05
+    h, g = np.array([stiffness]), np.array([mass])
+    found = cycle_of(moving(MOTOR, limits, dwell), g, 0.0, h)
+    T = found.profile.duration
+    t = np.linspace(0.0, T, 200001)
+    r = found.profile.at(t)
+    there, back = (stiffness * x + mass * a for x, a in
+                   ((r[0], r[2]), (limits.stroke - r[0], -r[2])))  # fmt: skip
+    rest = dwell * (stiffness * limits.stroke) ** 2
+    mean = (np.trapezoid(there**2 + back**2, t) + rest) / (2.0 * (T + dwell))
+    most = max(np.abs(there).max(), np.abs(back).max(), abs(stiffness * limits.stroke))
+    assert found.peak_force == pytest.approx(most, rel=1e-7)
+    assert found.rms_force == pytest.approx(np.sqrt(mean), rel=1e-7)
+    assert found.power == pytest.approx(4.0 / 30.0**2 * mean, rel=1e-7)
+    with pytest.raises(UserError, match="acceleration"):
+        cycle_of(moving(MOTOR), g, 0.0, h)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_held_plant_has_its_motor_limits_with_slopes(sign: float) -> None:
+    """A table on leaf springs, or over a magnet: F = k r + m a, and derivatives by differences."""
+
+    def model(theta: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        m, k = theta["m"], sign * theta["k"]
+        stiffness = ca.blockcat([[k + 4e7, -4e7], [-4e7, 4e7]])
+        return {"mass": ca.diag(ca.vertcat(m, 0.2)), "stiffness": stiffness,
+                "damping_ratio": 0.01, "input": ca.DM([1, 0]), "output": ca.DM([[0, 1]]),
+                "hardware_cost": m}  # fmt: skip
+
+    plant = build_plant(model, ("m", "k"), {})
+    motion = moving(MOTOR, MoveLimits(0.002, 0.2, 10.0, 2e3, 1e7), 0.05)
+    motion = replace(motion, motor=replace(MOTOR, moving_mass=(0.0,), rms_power=20.0))
+    held, theta = with_motion(plant, motion, ["m", "k"], {}), np.array([1.5, 2e4])
+    value = constraint_values(held, theta)
+    profile = setpoint(motion.limits)
+    r = profile.at(np.linspace(0.0, profile.duration, 20001))
+    force = sign * 2e4 * r[0] + 1.7 * r[2]
+    most = max(np.abs(force).max(), 2e4 * 0.002)
+    assert value[0] == pytest.approx(most / 300.0 - 1.0, abs=1e-4)  # the spring gives 5e-5
+    for row, number in zip(hardware_slopes(held, theta)[1], range(2), strict=True):
+        numeric = slopes(
+            lambda s, i=number: constraint_values(held, s * theta)[[i]], np.ones(2), 1e-4
+        )
+        assert row * theta == pytest.approx(numeric[0], abs=1e-6)
 
 
 def test_a_catalogue_is_met_at_its_motors() -> None:
