@@ -80,6 +80,18 @@ class Filters:
                  for name, given in orders if given]  # fmt: skip
         return ", ".join(found)
 
+    @property
+    def delays(self) -> tuple[float, ...]:
+        """How late a slow signal comes out, s: 1/ω₁ + 2ζ/ω₂ for each entry."""
+        count, late = max(len(self.lag_hz), len(self.second_order_hz)), 0.0
+        if self.lag_hz:
+            late = late + 1.0 / np.resize(self.lag_hz, count)
+        if self.second_order_hz:
+            late = late + 2.0 * np.resize(self.damping, count) / np.resize(
+                self.second_order_hz, count
+            )
+        return tuple(np.atleast_1d(late / HZ).tolist())
+
     def system(self, channels: int, key: str) -> StateSpace:
         """The diagonal system (channels x channels), in rad/s. Raises PlantError where a list has
         another number of entries."""
@@ -142,6 +154,12 @@ class Wiring:
         both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
         there = [f"{name} {own.words}" for name, own in both if own]
         words = "disturbing forces act on the machine, its unfiltered position counts"
+        if self.sensor:
+            late = " and ".join(f"{1e6 * delay:.3g}" for delay in dict.fromkeys(self.sensor.delays))
+            words += (
+                f"; the sensor is {late} us late: at a speed v the position leads the setpoint by v "
+                "times that, unless the setpoint of the loop (not its feedforward) is as late"
+            )
         return f"{' and '.join(there)} in every loop; {words}"
 
     def poles(self, outputs: int, inputs: int) -> np.ndarray | None:

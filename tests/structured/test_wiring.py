@@ -170,3 +170,16 @@ def test_a_wiring_is_part_of_the_plants_identity(tmp_path) -> None:
     identities = [str(problem.identity()) for problem in problems]
     assert len(set(identities)) == 3
     assert "wiring" not in identities[0]  # what was stored before stays valid
+
+
+@pytest.mark.parametrize(
+    "filters",
+    [Filters((2e3,)), Filters((), (5e3,), (0.7,)), Filters((2e3, 1e3), (5e3, 4e3), (0.7,))],
+)
+def test_the_delay_of_a_filter_is_its_slope_of_phase_at_rest(filters: Filters) -> None:
+    count, slow = len(filters.lag_hz or filters.second_order_hz), 1.0
+    response = filters.system(count, "sensor").response(np.array([slow]))[0]
+    late = -np.angle(np.diag(response)) / slow
+    assert late == pytest.approx(filters.delays, rel=1e-6)
+    words = Wiring(sensor=filters).words
+    assert all(f"{1e6 * delay:.3g}" in words for delay in filters.delays)
