@@ -83,14 +83,13 @@ class Filters:
     @property
     def delays(self) -> tuple[float, ...]:
         """How late a slow signal comes out, s: 1/ω₁ + 2ζ/ω₂ for each entry."""
-        count, late = max(len(self.lag_hz), len(self.second_order_hz)), 0.0
+        count = max(len(self.lag_hz), len(self.second_order_hz))
+        late = np.zeros(count)
         if self.lag_hz:
-            late = late + 1.0 / np.resize(self.lag_hz, count)
+            late += 1.0 / np.resize(self.lag_hz, count)
         if self.second_order_hz:
-            late = late + 2.0 * np.resize(self.damping, count) / np.resize(
-                self.second_order_hz, count
-            )
-        return tuple(np.atleast_1d(late / HZ).tolist())
+            late += 2.0 * np.resize(np.divide(self.damping, self.second_order_hz), count)
+        return tuple((late / HZ).tolist())
 
     def system(self, channels: int, key: str) -> StateSpace:
         """The diagonal system (channels x channels), in rad/s. Raises PlantError where a list has
@@ -157,8 +156,8 @@ class Wiring:
         if self.sensor:
             late = " and ".join(f"{1e6 * delay:.3g}" for delay in dict.fromkeys(self.sensor.delays))
             words += (
-                f"; the sensor is {late} us late: at a speed v the position leads the setpoint by v "
-                "times that, unless the setpoint of the loop (not its feedforward) is as late"
+                f"; the sensor is {late} us late: at a speed v the position leads the setpoint by "
+                "v times that, unless the setpoint of the loop (not its feedforward) is as late"
             )
         return f"{' and '.join(there)} in every loop; {words}"
 
