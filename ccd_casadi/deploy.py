@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment import Timing
-from ccd_casadi.robust import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_of
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
@@ -106,10 +106,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     )
     reduced = 0 if kind.as_designed else channels
     moved, steps = None, reduced + 2 + (options.saturation is not None)
-    fixed = None
+    fixed, (limits, window) = None, move_of(options, finished)
     if options.fixed:
-        steps_given = options.sensor_step, options.force_step
-        fixed = FixedRequest(options.fixed, move_limits(options), *steps_given)
+        fixed = FixedRequest(options.fixed, limits, options.sensor_step, options.force_step)
     with Progress(steps, "deploying") as bar:
         found = deploy(
             finished, timing, saturation=options.saturation, single=options.single, fixed=fixed,
@@ -118,7 +117,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         if found.stable:
             moved = on_hardware(
                 finished.loop.plant, found.realisation, found.delay,
-                finished.bandwidth, limits=move_limits(options), window=options.window,
+                finished.bandwidth, limits=limits, window=window,
                 hardware=electronics, places=kind.bounds().places,
                 ports=finished.loop.ports if finished.loop.ported else None,
                 progress=lambda words: bar.advance(note=words),

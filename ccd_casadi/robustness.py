@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from ccd_casadi.robust import MOVE_OPTIONS, Demands, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, Demands, move_of
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, option, positive, real, valued
@@ -57,6 +57,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         if options.out is None:  # the run's own page stays
             place = options.run / f"robustness_{options.controller.stem}"
     folder = run_folder(options.run, place)
+    limits, window = move_of(options, finished, options.axis - 1)
     demands = Demands(
         shift=options.shift / 100.0,
         damping=tuple(options.damping),
@@ -64,8 +65,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         samples=options.samples,
         sensor=options.noise,
         disturbance=options.disturbance,
-        limits=move_limits(options),
-        window=options.window,
+        limits=limits,
+        window=window,
         axis=options.axis - 1,
     )
     with Workers(options.workers, PoolOptions.patience) as workers:

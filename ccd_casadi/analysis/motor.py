@@ -218,8 +218,9 @@ def _peak(profile: Setpoint, h: Any, g: Any, far: float, options: MotionOptions)
     r, v, a, j, s = profile.inside(shares).real
     f, slope, bend = (np.real(h) * x + np.real(g) * y for x, y in ((r, a), (v, j), (a, s)))
     size = np.maximum(profile.durations.real, 1e-300)[:, None]
-    step = np.divide(-slope, bend * size, out=np.zeros_like(f), where=bend != 0.0)
-    near = np.clip(shares + np.clip(step, -shares[1], shares[1]), 0.0, 1.0)
+    far_off = np.abs(slope) >= shares[1] * np.abs(bend) * size  # a step beyond the next instant
+    step = np.divide(-slope, bend * size, out=np.zeros_like(f), where=~far_off)
+    near = np.clip(shares + step, 0.0, 1.0)
     r, _, a, *_ = profile.inside(near)
     found = np.append((h * r + g * a).ravel(), h * far)
     return found[np.abs(np.real(found)).argmax()]

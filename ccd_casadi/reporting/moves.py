@@ -59,10 +59,7 @@ def move_blocks_of(
         profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        own = "set your own under [move]"
-        if ahead is None:  # on a spring, which a [move] refuses
-            own = "robustness takes another"
-        other = f"; {own}"
+        other = "; set your own under [move]"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip

@@ -4,10 +4,14 @@ The demands are options of `robustness` and of `deploy`.
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from ccd_casadi.analysis import LIMITS, MoveLimits
-from ccd_casadi.support.options import positive, valued
+from ccd_casadi.support.options import option, positive
+
+if TYPE_CHECKING:
+    from ccd_casadi.cases.run_folder import FinishedRun
 
 
 @dataclass(frozen=True)
@@ -47,21 +51,38 @@ _MOVE = (
     ("window", _DEFAULT.window, "m; the error has to stay within it"),
 )
 MOVE_OPTIONS = [
-    valued(f"--{name}", "X", positive, f"{name} of the move, {unit}", default)
+    option(f"--{name}", metavar="X", type=positive,
+           help=f"{name} of the move, {unit} (default: that of [move], else {default:g})")
     for name, default, unit in _MOVE
-]
+]  # fmt: skip
 
 
-def move_limits(options: argparse.Namespace) -> MoveLimits:
-    """Take the limits of the move from a command's options.
+def move_of(
+    options: argparse.Namespace, run: "FinishedRun", axis: int = 0
+) -> tuple[MoveLimits, float]:
+    """Take a move from a command's options, else from the case's [move], else the default one.
 
     Parameters
     ----------
     options : argparse.Namespace
+        With those of `MOVE_OPTIONS`.
+    run : FinishedRun
+    axis : int
+        The output that moves, from 0; [move] is of the first.
 
     Returns
     -------
-    MoveLimits
-        SI.
+    MoveLimits, float
+        The limits and the window, SI.
     """
-    return MoveLimits(*(getattr(options, name) for name, _, _ in _MOVE[:-1]))
+    limits, window = LIMITS, LIMITS.window
+    if run.problem.source.motion is not None and axis == 0:
+        from ccd_casadi.inner_problem.structured_bandwidth import motion_of
+
+        motion = motion_of(run.problem, run.theta)
+        fastest = float(motion.cycle.profile.acceleration)  # the motor may allow less than is given
+        limits = replace(motion.motion.limits, acceleration=fastest)
+        window = motion.motion.window
+    given = {name: value for name, *_ in _MOVE if (value := getattr(options, name)) is not None}
+    window = given.pop("window", window)
+    return replace(limits, **given), window

@@ -50,7 +50,7 @@ def options_read(module: ModuleType) -> set[str]:
     text = Path(str(module.__file__)).read_text()
     shared = ROOT / "ccd_casadi" / "support" / "command_line.py"
     found = set(re.findall(r"\boptions\.(\w+)", text + shared.read_text()))
-    if "move_limits(options)" in text:
+    if "move_of(options" in text:
         found |= {name for name, _, _ in robust._MOVE}
     if "break_frequencies(options)" in text:
         found |= {"omega_S_hz", "omega_T_hz"}

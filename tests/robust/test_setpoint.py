@@ -1,7 +1,11 @@
 """The fourth-order setpoint, and the loop in a real move, against other ways to them."""
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import control
 import numpy as np
@@ -10,14 +14,21 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from oracles.helpers import few, random_plant
 
-from ccd_casadi.analysis import MoveLimits
+from ccd_casadi.analysis import LIMITS, MoveLimits
 from ccd_casadi.analysis.move import mass_feedforward, simulate
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.discretise import Conversion, discretise
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.robust import move_of
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 
 # ---- the setpoint -------------------------------------------------------------------------------
 
@@ -179,3 +190,23 @@ def test_feedforward_of_a_stage_with_several_inputs() -> None:
         assert (s**2 * G @ forces).real == pytest.approx(np.eye(3)[axis], abs=1e-6)
     one_sided = replace(modal, B=modal.B[:, :1])
     assert mass_feedforward(one_sided, 0) is None
+
+
+def test_a_command_makes_the_move_of_its_case_unless_options_change_it() -> None:
+    """[move] of the case, with the acceleration that the motor allows, of the first output."""
+    problem = problem_of(load_case(EXAMPLE))
+    run = SimpleNamespace(problem=problem, theta=problem.start)
+    nothing = dict.fromkeys(("stroke", "velocity", "acceleration", "jerk", "snap", "window"))
+
+    def of(axis: int = 0, **given: float) -> tuple[MoveLimits, float]:
+        return move_of(argparse.Namespace(**nothing | given), cast(FinishedRun, run), axis)
+
+    motion, (limits, window) = motion_of(problem, problem.start), of()
+    ours, own = setpoint(limits), motion.cycle.profile
+    assert ours.durations == pytest.approx(own.durations.real, rel=1e-9)
+    assert ours.snaps == pytest.approx(np.real(own.snaps))
+    assert window == motion.motion.window
+    other, wider = of(stroke=0.02, window=1e-3)
+    assert (other.stroke, wider) == (0.02, 1e-3)
+    assert replace(other, stroke=limits.stroke) == limits
+    assert of(axis=1) == (LIMITS, LIMITS.window)

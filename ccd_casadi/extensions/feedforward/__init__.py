@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.robust import MOVE_OPTIONS, move_limits
+from ccd_casadi.robust import MOVE_OPTIONS, move_of
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.extensions import Extension
@@ -52,7 +52,7 @@ FILE = "feedforward.json"
 def main(options: argparse.Namespace) -> ExitCode:
     """Find, judge, write feedforward.json, C code and the page; or learn from a move.
 
-    The move is that of [move] in the case; where there is none, that of the options.
+    The move is that of the options; what they leave out is as in [move] of the case.
     """
     from ccd_casadi.analysis.setpoint import setpoint
     from ccd_casadi.cases.run_folder import read_run
@@ -65,7 +65,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     )
     from ccd_casadi.extensions.feedforward.set_feedforward import (
         FeedforwardSetOptions,
-        profile_of,
         set_feedforward,
     )
     from ccd_casadi.reporting.run_verdict import index_of, publish
@@ -82,12 +81,11 @@ def main(options: argparse.Namespace) -> ExitCode:
         words = "of several sensors on one actuator the one whose error counts moves; leave it out"
         raise UserError(f"--axis: is {options.axis}; {words}")
     folder = run_folder(options.run, options.out or options.run / "feedforward")
-    own = profile_of(run) if options.axis == 1 else None
-    profile, window = own or (setpoint(move_limits(options)), options.window)
+    limits, window = move_of(options, run, options.axis - 1)
     if options.learn is not None:
         return _learn(run, folder, options.learn)
     found = set_feedforward(
-        run, profile, window, axis=options.axis - 1, taps=options.taps, seed=options.seed,
+        run, setpoint(limits), window, axis=options.axis - 1, taps=options.taps, seed=options.seed,
         options=FeedforwardSetOptions(judges=options.judges),
     )  # fmt: skip
     answer = entry(found, options.axis) | {"seed": options.seed, "versions": versions(),

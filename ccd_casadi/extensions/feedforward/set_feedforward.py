@@ -30,7 +30,6 @@ from ccd_casadi.extensions.feedforward.move_responses import (
     responses_of,
 )
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -287,11 +286,3 @@ def _best(
             "or a slower move"
         )
     return best
-
-
-def profile_of(run: FinishedRun) -> tuple[Setpoint, float] | None:
-    """The move and the window of a run's case; None where it has no [move]."""
-    if run.problem.source.motion is None:
-        return None
-    motion = motion_of(run.problem, run.theta)
-    return motion.cycle.profile, motion.motion.window
