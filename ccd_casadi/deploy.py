@@ -3,6 +3,7 @@
 import argparse
 import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment import Timing
@@ -62,30 +63,16 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
+    _require_one_precision(options)
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
-    from ccd_casadi.deployment import source_code
-    from ccd_casadi.deployment.deploy_files import DESIGN_FILES, write_files
-    from ccd_casadi.deployment.fixed_point import FixedRequest
-    from ccd_casadi.deployment.integer_loop import integer_faults
-    from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
+    from ccd_casadi.deployment.deploy_files import write_files
     from ccd_casadi.deployment.outcome import DeployedRun
-    from ccd_casadi.deployment.pipeline import deploy
-    from ccd_casadi.inner_problem.kinds import kind_of
-    from ccd_casadi.reporting.facts import run_name
 
-    structured_text, plcopen_xml = map(extensions.function, ("structured_text", "plcopen_xml"))
-    write_fmu = extensions.function("fmu") if options.fmu else None
-    if options.fmu and write_fmu is None:
-        raise UserError(extensions.missing("--fmu", "functions", "fmu"))
-    if options.single and options.fixed:
-        raise UserError("--single, --fixed: the code has one precision; drop one of them")
-    if options.fmu and (options.single or options.fixed):
-        raise UserError("--fmu: is of double precision; drop it, or --single, --fixed")
-    finished = read_run(options.run, of_share=True)
-    status = finished.result.get("status")
+    run = read_run(options.run, of_share=True)
+    status = run.result.get("status")
     if status != "verified" and not options.unverified:
-        reason = finished.result.get("reason") or "no reason is given"
+        reason = run.result.get("reason") or "no reason is given"
         words = f"the run is {status}: {reason}"
         remedy = "solve it again, or give --unverified to deploy it nevertheless"
         say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
@@ -94,58 +81,17 @@ def main(options: argparse.Namespace) -> ExitCode:
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"
         raise UserError(f"--out {folder}: {words}; choose another folder")
-    timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
-    electronics = Electronics(options.sensor_step, options.force_step, options.jitter, options.seed)
-    designed = finished.problem.sampling
-    rate_hz = options.rate_hz or (designed.rate_hz if designed else None)
-    if rate_hz is not None:  # else the rate is chosen first
-        electronics.require_in_order(1.0 / rate_hz)
-    channels, kind = (
-        len(finished.plant.C) if finished.plant.channels else 1,
-        kind_of(finished.problem),
-    )
-    reduced = 0 if kind.as_designed else channels
-    moved, steps = None, reduced + 2 + (options.saturation is not None)
-    fixed, (limits, window) = None, move_of(options, finished)
-    if options.fixed:
-        fixed = FixedRequest(options.fixed, limits, options.sensor_step, options.force_step)
-    with Progress(steps, "deploying") as bar:
-        found = deploy(
-            finished, timing, saturation=options.saturation, single=options.single, fixed=fixed,
-            progress=lambda words: bar.advance(note=words),
-        )  # fmt: skip
-        if found.stable:
-            moved = on_hardware(
-                finished.loop.plant, found.realisation, found.delay,
-                finished.bandwidth, limits=limits, window=window,
-                hardware=electronics, places=kind.bounds().places,
-                ports=finished.loop.ports if finished.loop.ported else None,
-                progress=lambda words: bar.advance(note=words),
-            )  # fmt: skip
-    found = replace(found, integer_faults=integer_faults(found.rounding, moved))
-    # an earlier controller must not pass for this one
-    formats = source_code.ST_FILE, source_code.XML_FILE, source_code.FMU_FILE
-    for name in (*DESIGN_FILES, *source_code.C_FILES, *formats):
-        (folder / name).unlink(missing_ok=True)
-    write_files(folder, finished, found, options.seed, moved)
+    found, moved = _deployed(run, options)
+    _remove_earlier(folder)
+    write_files(folder, run, found, options.seed, moved)
     if moved is not None:
-        K, name = found.realisation, run_name(options.run)
-        naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
-                                  "kind": kind.title}  # fmt: skip
-        texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
-        if structured_text is not None and K.precision == "double":
-            code = structured_text(K, **naming)
-            (folder / source_code.ST_FILE).write_text(code, "utf-8")
-            if plcopen_xml is not None:
-                (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
-        if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
-            say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    line = DeployedRun(finished, found).check(moved)
-    finished = with_verdict_line(finished, folder, line)
+        _write_code(folder, run, found, moved, options)
+    line = DeployedRun(run, found).check(moved)
+    run = with_verdict_line(run, folder, line)
     # a folder elsewhere leaves the run as it is, but the decision here is on what was deployed
-    verdict = finished.result.get("verdict")
+    verdict = run.result.get("verdict")
     known = {"verdict": {**verdict, line.name: line.entry}} if isinstance(verdict, dict) else {}
-    inform(_summary(finished, found, moved, {**finished.result, **known}))
+    inform(_summary(run, found, moved, {**run.result, **known}))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words
     from ccd_casadi.reporting.run_verdict import index_of, publish
@@ -154,14 +100,96 @@ def main(options: argparse.Namespace) -> ExitCode:
         last = list(moved.ways)[-1]
         far = with_unit(moved.ways[last].position[-1], spoken("m"))
         inform(f"{'a move':13s} of {far}, {way_words(last, [moved.ways[last]])}")
-
-    page = deploy_page(finished, found, moved, index_of(folder))
-    publish(finished.folder, folder / "report.html", page)
+    page = deploy_page(run, found, moved, index_of(folder))
+    publish(run.folder, folder / "report.html", page)
     inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
     say(one_line(f"not verified: {shortfall_words(found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
+
+
+def _require_one_precision(options: argparse.Namespace) -> None:
+    """Raise UserError where options want code of two precisions, or an FMU that nothing writes."""
+    if options.fmu and extensions.function("fmu") is None:
+        raise UserError(extensions.missing("--fmu", "functions", "fmu"))
+    if options.single and options.fixed:
+        raise UserError("--single, --fixed: the code has one precision; drop one of them")
+    if options.fmu and (options.single or options.fixed):
+        raise UserError("--fmu: is of double precision; drop it, or --single, --fixed")
+
+
+def _deployed(
+    run: "FinishedRun", options: argparse.Namespace
+) -> tuple["Deployment", "OnHardware | None"]:
+    """Deploy a run's controller, and simulate its move where the loop is stable."""
+    from ccd_casadi.deployment.fixed_point import FixedRequest
+    from ccd_casadi.deployment.integer_loop import integer_faults
+    from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
+    from ccd_casadi.deployment.pipeline import deploy
+    from ccd_casadi.inner_problem.kinds import kind_of
+
+    timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
+    electronics = Electronics(options.sensor_step, options.force_step, options.jitter, options.seed)
+    designed, kind = run.problem.sampling, kind_of(run.problem)
+    rate_hz = options.rate_hz or (designed.rate_hz if designed else None)
+    if rate_hz is not None:  # else the rate is chosen first
+        electronics.require_in_order(1.0 / rate_hz)
+    channels = len(run.plant.C) if run.plant.channels else 1
+    steps = (0 if kind.as_designed else channels) + 2 + (options.saturation is not None)
+    moved, fixed, (limits, window) = None, None, move_of(options, run)
+    if options.fixed:
+        fixed = FixedRequest(options.fixed, limits, options.sensor_step, options.force_step)
+    with Progress(steps, "deploying") as bar:
+        found = deploy(
+            run, timing, saturation=options.saturation, single=options.single, fixed=fixed,
+            progress=lambda words: bar.advance(note=words),
+        )  # fmt: skip
+        if found.stable:
+            moved = on_hardware(
+                run.loop.plant, found.realisation, found.delay, run.bandwidth, limits=limits,
+                window=window, hardware=electronics, places=kind.bounds().places,
+                ports=run.loop.ports if run.loop.ported else None,
+                progress=lambda words: bar.advance(note=words),
+            )  # fmt: skip
+    return replace(found, integer_faults=integer_faults(found.rounding, moved)), moved
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove what an earlier deployment wrote: its controller must not pass for this one."""
+    from ccd_casadi.deployment import source_code
+    from ccd_casadi.deployment.deploy_files import DESIGN_FILES
+
+    formats = source_code.ST_FILE, source_code.XML_FILE, source_code.FMU_FILE
+    for name in (*DESIGN_FILES, *source_code.C_FILES, *formats):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _write_code(
+    folder: Path,
+    run: "FinishedRun",
+    found: "Deployment",
+    moved: "OnHardware",
+    options: argparse.Namespace,
+) -> None:
+    """Write the controller as C, and as structured text and an FMU where extensions make them."""
+    from ccd_casadi.deployment import source_code
+    from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.facts import run_name
+
+    structured_text, plcopen_xml = map(extensions.function, ("structured_text", "plcopen_xml"))
+    K, name = found.realisation, run_name(options.run)
+    naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
+                              "kind": kind_of(run.problem).title}  # fmt: skip
+    texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
+    if structured_text is not None and K.precision == "double":
+        code = structured_text(K, **naming)
+        (folder / source_code.ST_FILE).write_text(code, "utf-8")
+        if plcopen_xml is not None:
+            (folder / source_code.XML_FILE).write_text(plcopen_xml(code, name), "utf-8")
+    write_fmu = extensions.function("fmu") if options.fmu else None
+    if write_fmu and not write_fmu(folder / source_code.FMU_FILE, K, texts, name):
+        say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
 
 
 def _summary(
