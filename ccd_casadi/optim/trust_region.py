@@ -328,98 +328,197 @@ def minimise(
     return Minimum(here, radius, evaluations, False)
 
 
+@dataclass(frozen=True)
+class _CurvedRows:
+    """The rows c(p) = c + ∇c p + ½ pᵀ ∇²c p that a step may lift over their bounds.
+
+    Attributes
+    ----------
+    value, slopes : array (k,), (k, n)
+        c and ∇c.
+    elastic : array (k,)
+        1 where σ may lift the bound, 0 of a row that must hold.
+    bending : array (b,) of int
+        The rows whose ∇²c is known.
+    hessians : array (b, n, n)
+        Theirs; of the others ∇²c counts as 0.
+    """
+
+    value: Array
+    slopes: Array
+    elastic: Array
+    bending: np.ndarray
+    hessians: Array
+
+    def levels(self, ends: Array) -> Array:
+        """c(p) at p (j, n): (j, k)."""
+        found = self.value + ends @ self.slopes.T
+        found[:, self.bending] += 0.5 * ((ends @ self.hessians) * ends).sum(axis=2).T
+        return found
+
+    def tangent(self, p: Array) -> tuple[Array, Array]:
+        """Slopes A (k, n) and offset (k,) of the rows linear at p, so that c(p) = A p + offset."""
+        A, offset, bend = self.slopes.copy(), self.value.copy(), self.hessians @ p
+        A[self.bending] += bend
+        offset[self.bending] -= 0.5 * bend @ p
+        return A, offset
+
+    def bent_along(self, way: Array, offset: Array) -> Array:
+        """An offset, with what the rows bend along a way from where they are linear."""
+        found = offset.copy()
+        found[self.bending] += 0.5 * (self.hessians @ way) @ way
+        return found
+
+    def with_hessians(self, rows: np.ndarray, hessians: Array) -> "_CurvedRows":
+        """With those of further rows."""
+        return replace(self, bending=np.concatenate([self.bending, rows]),
+                       hessians=np.concatenate([self.hessians, hessians]))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Programme:
+    """A quadratic programme of a step around p, with rows A p + offset <= σ.
+
+    Attributes
+    ----------
+    p : array (n,)
+        Around which it is: M acts on what a solution differs from it.
+    near : float
+        How far from p a solution may be.
+    M : array (n, n)
+        Positive definite.
+    A, offset : array (k, n), (k,)
+    """
+
+    p: Array
+    near: float
+    M: Array
+    A: Array
+    offset: Array
+
+
 def best_step(
     model: TrustRegionModel[Data], here: Iterate[Data], H: Array, radius: float, penalty: float
 ) -> Step | None:
-    """The best step that the model knows; None where its programme has no answer."""
+    """Find the best step that the model knows.
+
+    It minimises the model of the merit, φ(p) = ∇f·p + ½ pᵀ H p + ρ max(0, max c(p)), by programmes
+    around each other, the first one around 0:
+
+    1. The solution w of the programme around p, and the multipliers μ of its rows.
+    2. Rows that hold w, or may bend over their bounds there, get their Hessians.
+    3. The best by φ of some shares of the way from p to w. If it is not the whole way, a programme
+       whose rows bend as they do on it gives one point more.
+    4. The next programme is around that point: its rows are linear there, its Hessian is that of
+       the Lagrangian, H + Σ μ ∇²c, made convex. Where φ does not fall, it is nearer to p instead.
+
+    Parameters
+    ----------
+    model, here : TrustRegionModel, Iterate
+    H : array (n, n)
+    radius, penalty : float
+        Δ and ρ.
+
+    Returns
+    -------
+    Step or None
+        None where the first programme has no solution.
+    """
     rows, options = model.rows(here, radius), model.step_options
-    margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
-    chosen = np.arange(len(rows.value))
-    if not model.carried:  # a row that the step cannot lift over its bound is none of it
-        chosen = _within_reach(rows.value + margin, rows.slopes, radius)
-    n = len(here.x)
-    value, slopes = rows.value[chosen], rows.slopes[chosen]
-    elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
-    soft = slice(None) if rows.hard is None else elastic > 0.0
+    chosen, curved = _rows_in_reach(model, rows, len(here.x), radius)
+    soft = slice(None) if rows.hard is None else curved.elastic > 0.0
     unit = _unit(here, penalty if model.carried else 0.0)
     weight = options.elastic_penalty * (unit + penalty) if model.growing else penalty
-    multipliers = np.zeros(len(rows.value))
+    low, high = _ends(model, here, radius)
 
-    curved, bending = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
+    def solution(at: _Programme, offset: Array) -> tuple[Array, Array] | None:
+        cost = here.gradient + (H - at.M) @ at.p
+        ends = np.maximum(low, at.p - at.near), np.minimum(high, at.p + at.near)
+        return solve_elastic(at.M, cost, at.A, offset, curved.elastic, *ends, weight, radius, unit,
+                             free=model.carried)  # fmt: skip
 
     def gains(ends: Array) -> Array:
-        """Of merit at p (k, n), with what is known of the curvature of the rows."""
-        level = value + ends @ slopes.T
-        level[:, bending] += 0.5 * ((ends @ curved) * ends).sum(axis=2).T
-        most = level[:, soft].max(axis=1, initial=-np.inf if model.carried else 0.0)
+        """φ(0) - φ(p) at p (j, n)."""
+        most = curved.levels(ends)[:, soft].max(axis=1, initial=-np.inf if model.carried else 0.0)
         curve = 0.5 * ((ends @ H) * ends).sum(axis=1)
         return np.asarray(penalty * (here.violation - most) - ends @ here.gradient - curve)
 
-    def answer(offset: Array) -> tuple[Array, Array] | None:
-        """That of the programme around p with these rows: M acts on what is left of p."""
-        cost = here.gradient + (H - M) @ p
-        ends = np.maximum(low, p - near), np.minimum(high, p + near)
-        return solve_elastic(
-            M, cost, at, offset, elastic, *ends, weight, radius, unit, free=model.carried
-        )
-
-    at, offset, M, p = slopes, value + margin[chosen], convex(H, options.flat * unit), np.zeros(n)
-    (low, high), near, straight = _ends(model, here, radius), radius, 0.0
-    best, shares = None, options.shares
+    margin = 0.0 if rows.margin is None else rows.margin[chosen]
+    M = convex(H, options.flat * unit)
+    at = _Programme(np.zeros(len(here.x)), radius, M, curved.slopes, curved.value + margin)
+    best, straight = None, 0.0
     for turn in range(options.programmes):
-        found = answer(offset)
-        if found is None:
+        if (found := solution(at, at.offset)) is None:
             break
-        way, mu = found[0] - p, found[1]
+        w, mu = found
         if model.growing:
             penalty = max(options.fading * penalty, 2.0 * float(mu.sum()))
         elif rows.curved and not model.restoring:
             penalty = min(weight, options.curved_penalty * float(mu.sum() + unit))
         if turn == 0:
-            straight = float(gains(way[None])[0])
+            straight = float(gains((w - at.p)[None])[0])
         holds = mu > options.holds * weight
-        counts = holds.copy()
-        if model.bending:
-            moved = np.abs(slopes) @ np.abs(found[0])
-            counts |= offset + at @ found[0] > -options.bends * moved
-        counts[bending] = False
-        fresh = np.flatnonzero(counts & (chosen < rows.curved))
+        fresh = _rows_to_bend(model, curved, at, w, holds, chosen < rows.curved)
         if len(fresh) and rows.hessians is not None:
-            curved = np.concatenate([curved, rows.hessians(chosen[fresh])])
-            bending = np.concatenate([bending, fresh])
-        size = float(np.abs(way).max())
+            curved = curved.with_hessians(fresh, rows.hessians(chosen[fresh]))
         # The rows bend less on part of the way: a whole one may lead further and further out.
-        tried = p + np.array(shares if rows.curved else shares[:1])[:, None] * way
-        known, *reached = gains(np.vstack([p, tried])).tolist()
-        if turn and reached[0] < max(reached):  # the whole of it, with what the rows bend on it
-            bends = offset.copy()
-            bends[bending] += 0.5 * (curved @ way) @ way
-            if (other := answer(bends)) is not None:
+        shares = np.array(options.shares if rows.curved else options.shares[:1])
+        way = w - at.p
+        tried = at.p + shares[:, None] * way
+        known, *reached = gains(np.vstack([at.p, tried])).tolist()
+        if turn and reached[0] < max(reached):
+            other = solution(at, curved.bent_along(way, at.offset))
+            if other is not None:
                 tried = np.vstack([tried, other[0]])
                 reached += gains(other[0][None]).tolist()
-        predicted = max(reached)
+        predicted, size = max(reached), float(np.abs(way).max())
         better = predicted - known
         if better > 0.0 or not rows.curved:
             end = tried[reached.index(predicted)]
-            near, p = 2.0 * float(np.abs(end - p).max()), end
+            at = replace(at, p=end, near=2.0 * float(np.abs(end - at.p).max()))
         else:
-            near, predicted = 0.5 * shares[-1] * size, known
+            at, predicted = replace(at, near=0.5 * options.shares[-1] * size), known
+        if rows.curved:
+            A, offset = curved.tangent(at.p)
+            of_rows = np.where(holds, mu, 0.0)[curved.bending]
+            lagrangian = H + np.einsum("m,mij->ij", of_rows, curved.hessians)
+            M = lagrangian + options.convexifying * A[holds].T @ A[holds]
+            at = replace(at, A=A, offset=offset, M=convex(M, options.flat * unit))
         multipliers = np.zeros(len(rows.value))
         multipliers[chosen] = mu
-        if rows.curved:
-            bend = curved @ p
-            at, offset = at if turn else slopes.copy(), value.copy()
-            at[bending] = slopes[bending] + bend
-            offset[bending] -= 0.5 * bend @ p
-            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bending], curved)
-            active = at[holds]
-            M = convex(lagrangian + options.convexifying * active.T @ active, options.flat * unit)
-        best = Step(p, predicted, straight, M, multipliers, rows, penalty)
+        best = Step(at.p, predicted, straight, at.M, multipliers, rows, penalty)
         settled = size < options.settled * radius
         little = better < options.little * predicted if better > 0.0 else settled
         if not rows.curved or (turn and little and not len(fresh)):
             break
     return best
+
+
+def _rows_in_reach(
+    model: TrustRegionModel[Data], rows: Rows, n: int, radius: float
+) -> tuple[np.ndarray, _CurvedRows]:
+    """The rows that a step of this radius may lift over their bounds, by index, and as they are."""
+    chosen = np.arange(len(rows.value))
+    if not model.carried:
+        margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
+        chosen = _within_reach(rows.value + margin, rows.slopes, radius)
+    elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
+    none = np.zeros(0, int), np.zeros((0, n, n))
+    return chosen, _CurvedRows(rows.value[chosen], rows.slopes[chosen], elastic, *none)
+
+
+def _rows_to_bend(
+    model: TrustRegionModel[Data], curved: _CurvedRows, at: _Programme, w: Array,
+    holds: np.ndarray, known: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """The rows whose Hessians are `known` and not used yet: they hold w, or are so near to their
+    bounds there that they may bend over them."""
+    counts = holds.copy()
+    if model.bending:
+        moved = np.abs(curved.slopes) @ np.abs(w)
+        counts |= at.offset + at.A @ w > -model.step_options.bends * moved
+    counts[curved.bending] = False
+    return np.flatnonzero(counts & known)
 
 
 def _corrected(
