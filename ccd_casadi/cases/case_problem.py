@@ -9,7 +9,7 @@ from typing import Any
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
 from ccd_casadi.cases.controller_tables import DriveTable, filters_of, motion_problem
-from ccd_casadi.cases.tables import BudgetTable, Case, PlacesTable, RobustTable
+from ccd_casadi.cases.tables import BudgetTable, Case, InnerTable, PlacesTable, RobustTable
 from ccd_casadi.inner_problem.controller_problem import (
     BANDWIDTH,
     MixedSensitivityProblem,
@@ -84,39 +84,20 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
     (('m1', 'm2'), -0.995, 6.283)
     """
-    inner = case.inner
     if case.drive.name is not None:
         words = "is designed by `ccd drive` alone; use that, or drop [drive] for free sections"
         raise CaseError(f"{case.path}: drive: {words}")
     if case.robust.share is not None:
         words = "is kept by `ccd tolerances` alone; use that, or drop share for the whole box"
         raise CaseError(f"{case.path}: robust.share: {words}")
-    file = function = given = None
-    if callable(case.plant.function):
-        function, given = case.plant.name, GivenFunction(case.plant.function)
-    elif case.plant.function is not None:
-        name, function = case.plant.function.rsplit(":", 1)
-        file = str((case.path.parent / name).resolve())
-    positions = budget = None
-    if case.places != PlacesTable() or case.budget != BudgetTable():  # few cases have these
-        from ccd_casadi.cases.budget import error_budget, places_of
+    source, structured = _source(case), case.controller.structure == "sections"
+    budget = None
+    if case.budget != BudgetTable():  # few cases have one
+        from ccd_casadi.cases.budget import error_budget
 
-        positions, budget = places_of(case.places), error_budget(case.budget)
-    structured = case.controller.structure == "sections"
+        budget = error_budget(case.budget)
     problem = CoDesignProblem(
-        source=PlantSource(
-            case.plant.model,
-            file,
-            function,
-            _options(case.plant.options),
-            case.limits.plant_seconds,
-            content=None if given is None else token_hex(),
-            fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
-            motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
-            places=positions,
-            wiring=Wiring(filters_of(case.actuator), filters_of(case.sensor)),
-            given=given,
-        ).pinned(),
+        source=source,
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
         lower=tuple(p.lower for p in case.theta),
@@ -126,20 +107,10 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         w1=case.objective.w1,
         w2=case.objective.w2,
         cost_unit=case.objective.cost_unit,
-        weights=weights_of(case.controller, case.weights, inner),
-        inner=InnerBounds(
-            S_max=inner.S_max,
-            S_low=inner.S_low,
-            omega_low=HZ * inner.omega_low_hz,
-            omega_S=(HZ * inner.omega_S_hz[0], HZ * inner.omega_S_hz[1]),
-            omega_T=(HZ * inner.omega_T_hz[0], HZ * inner.omega_T_hz[1]),
-            gamma_backoff=inner.gamma_backoff,
-            sweep_points=inner.sweep_points,
-            # a fixed structure bounds it on every plant of its set
-            compliance_max=None if structured else inner.compliance_max,
-        ),
+        weights=weights_of(case.controller, case.weights, case.inner),
+        inner=_inner_bounds(case.inner, structured),
         suspension=_suspension(case),
-        method=inner.method,
+        method=case.inner.method,
         robust=None if structured else _robust(case.robust),
         controller=structured_problem(case, tuple(map(_options, case.robust.plants)))
         if structured
@@ -148,39 +119,92 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         spoken=(case.units.output, case.units.input),
     )
     try:
-        others = problem.controller.plant_options
-        plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
-        problem.controller.require_plants(plants)
-        if math.isnan(problem.weights.M_K):
-            problem = _with_a_scale(problem)
-        _require_ports_known(problem)
-        if (motion := problem.source.motion) is not None:
-            from ccd_casadi.inner_problem.structured_bandwidth import require_motion
-            from ccd_casadi.inner_problem.structured_plant_set import break_points_of
-
-            if places := break_points_of(problem):  # the one whose error counts moves
-                motion = replace(motion, output=places[0].output)
-                problem = replace(problem, source=replace(problem.source, motion=motion))
-            require_motion(problem)
+        problem = _with_known_plant(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
-            from ccd_casadi.cases.diagnosis import diagnose
-            from ccd_casadi.cases.findings import Severity, Topic
-
-            with kept_quiet(True):
-                found = diagnose(problem, case.suspension.rigid_modes)[1]
-            for finding in found:
-                of_a_sample = at_a_sample and finding.topic is Topic.BETWEEN
-                if finding.severity is Severity.ERROR and not of_a_sample:
-                    raise PlantError(finding.words)
+            _require_sound(problem, case.suspension.rigid_modes, at_a_sample)
     except UserError as error:
         raise CaseError(one_line(f"{case.path}: plant: {error}")) from error
     except Exception as error:
-        if function is None:
+        if source.function is None:
             raise
-        words = f"{function} raised {raised_words(error)}; correct it"
+        words = f"{source.function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _source(case: Case) -> PlantSource:
+    """What the case's plant is made from."""
+    file = function = given = positions = None
+    if callable(case.plant.function):
+        function, given = case.plant.name, GivenFunction(case.plant.function)
+    elif case.plant.function is not None:
+        name, function = case.plant.function.rsplit(":", 1)
+        file = str((case.path.parent / name).resolve())
+    if case.places != PlacesTable():
+        from ccd_casadi.cases.budget import places_of
+
+        positions = places_of(case.places)
+    return PlantSource(
+        case.plant.model,
+        file,
+        function,
+        _options(case.plant.options),
+        case.limits.plant_seconds,
+        content=None if given is None else token_hex(),
+        fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
+        motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
+        places=positions,
+        wiring=Wiring(filters_of(case.actuator), filters_of(case.sensor)),
+        given=given,
+    ).pinned()
+
+
+def _inner_bounds(inner: InnerTable, structured: bool) -> InnerBounds:
+    """The bounds and ranges of [inner], rad/s."""
+    return InnerBounds(
+        S_max=inner.S_max,
+        S_low=inner.S_low,
+        omega_low=HZ * inner.omega_low_hz,
+        omega_S=(HZ * inner.omega_S_hz[0], HZ * inner.omega_S_hz[1]),
+        omega_T=(HZ * inner.omega_T_hz[0], HZ * inner.omega_T_hz[1]),
+        gamma_backoff=inner.gamma_backoff,
+        sweep_points=inner.sweep_points,
+        # a fixed structure bounds it on every plant of its set
+        compliance_max=None if structured else inner.compliance_max,
+    )
+
+
+def _with_known_plant(problem: CoDesignProblem) -> CoDesignProblem:
+    """Check the plant against controller, ports and move, and complete what it decides."""
+    others = problem.controller.plant_options
+    plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
+    problem.controller.require_plants(plants)
+    if math.isnan(problem.weights.M_K):
+        problem = _with_a_scale(problem)
+    _require_ports_known(problem)
+    if (motion := problem.source.motion) is not None:
+        from ccd_casadi.inner_problem.structured_bandwidth import require_motion
+        from ccd_casadi.inner_problem.structured_plant_set import break_points_of
+
+        if places := break_points_of(problem):  # the one whose error counts moves
+            motion = replace(motion, output=places[0].output)
+            problem = replace(problem, source=replace(problem.source, motion=motion))
+        require_motion(problem)
+    return problem
+
+
+def _require_sound(problem: CoDesignProblem, rigid_modes: int | None, at_a_sample: bool) -> None:
+    """Raise PlantError where the diagnosis of the plant finds an error."""
+    from ccd_casadi.cases.diagnosis import diagnose
+    from ccd_casadi.cases.findings import Severity, Topic
+
+    with kept_quiet(True):
+        found = diagnose(problem, rigid_modes)[1]
+    for finding in found:
+        of_a_sample = at_a_sample and finding.topic is Topic.BETWEEN
+        if finding.severity is Severity.ERROR and not of_a_sample:
+            raise PlantError(finding.words)
 
 
 def _require_ports_known(problem: CoDesignProblem) -> None:
