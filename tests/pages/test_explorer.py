@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from ccd_casadi import inner
+from ccd_casadi.analysis import LIMITS, MoveLimits
+from ccd_casadi.analysis.motor import Motion
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
@@ -212,6 +215,7 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
     assert "feedforward" in move_words(c)
     alone = replace(c, move=replace(c.move, feedforward=False))
     assert "without feedforward" in move_words(alone)
+    assert "[move]" in move_words(c, own=True)
 
 
 def test_margins_are_drawn_where_the_loop_has_them(session):
@@ -400,3 +404,16 @@ def test_a_notch_that_is_none_changes_nothing_and_a_hurtful_one_is_called_unstab
     assert slow.stable == (slow.margins.phase_deg > 0.0)
     wide = replace(view.loop, controller=Notch(0.3, 50.0, 2.0).behind(view.loop.controller))
     assert wide.stable == bool((wide.poles.real < 0.0).all())
+
+
+def test_the_move_that_is_drawn_is_that_of_the_case(searched_look):
+    """With [move] its setpoint, window and feedforward; the default one without."""
+    plain = curves_of(searched_look).move
+    assert plain.duration == pytest.approx(setpoint(LIMITS).duration)
+    limits = MoveLimits(0.002, 0.1, 5.0, 1e3, 1e6)
+    source = replace(searched_look.problem.source, motion=Motion(limits, 1e-7))
+    problem = replace(searched_look.problem, source=source)
+    own = curves_of(replace(searched_look, problem=problem)).move
+    assert own.duration == pytest.approx(setpoint(limits).duration)
+    assert (own.window, own.position[-1]) == (1e-7, pytest.approx(0.002))
+    assert own.feedforward

@@ -19,6 +19,7 @@ from ccd_casadi.extensions.explorer.designs import ExploredDesign, Standing
 from ccd_casadi.extensions.explorer.knobs import Notched
 from ccd_casadi.inner_problem.kinds import kind_of, loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import Loop, Sampling
@@ -106,10 +107,14 @@ def curves_of(design: ExploredDesign) -> Curves | None:
 
 
 def _move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
-    """The default one of robustness."""
+    """The move of [move], else the default one of robustness."""
+    profile, window = setpoint(LIMITS), LIMITS.window
+    ahead = mass_feedforward(design.modal, 0, loop.at)
+    if design.problem.source.motion is not None:
+        motion = motion_of(design.problem, design.theta)
+        profile, window, ahead = motion.cycle.profile, motion.motion.window, motion.forward
     ((made,),) = moves(
-        [loop], [mass_feedforward(design.modal, 0, loop.at)], setpoint(LIMITS), axis=0,
-        window=LIMITS.window, bandwidth_hz=bandwidth_hz,
+        [loop], [ahead], profile, axis=0, window=window, bandwidth_hz=bandwidth_hz,
         options=MoveOptions(doublings=1, patient_doublings=1),
     )  # fmt: skip
     return made.until(WATCHED * made.duration)
@@ -163,10 +168,12 @@ def standing_html(
     )  # fmt: skip
 
 
-def move_words(curves: Curves | None) -> str:
-    """What the figure of the move shows."""
+def move_words(curves: Curves | None, own: bool = False) -> str:
+    """Describe the figure of the move; `own`: it is that of the case."""
     if curves is None or curves.unstable:
         return ""
+    if own:
+        return "that of [move], with feedforward up to snap"
     return f"the default one of robustness, {curves.move.words}"
 
 

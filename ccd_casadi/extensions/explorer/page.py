@@ -248,7 +248,7 @@ class ExplorerPage:
             "say_notch": escape(NO_NOTCH if notched is None else notched.words(design.knobs.S_max)),
         } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY), colour)
              for made in self.figures}  # fmt: skip
-        words["say_move"] = move_words(curves)
+        words["say_move"] = move_words(curves, design.problem.source.motion is not None)
         colour = ON_DARK.get(colour, colour) if self._dark else colour
         frame = design.how is not How.PRESENT and curves is not None
         changes = [change for made in self.figures for change in
