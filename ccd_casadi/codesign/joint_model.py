@@ -19,14 +19,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.optim.trust_region import (
-    Iterate,
-    Radius,
-    Rows,
-    StepOptions,
-    TrustRegionModel,
-    minimise,
-)
+from ccd_casadi.optim.step import Iterate, Rows, StepOptions, TrustRegionModel
+from ccd_casadi.optim.trust_region import Radius, minimise
 from ccd_casadi.plants.plant import Evaluate, Mechanics, hardware_cost, to_first_order
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -25,7 +25,8 @@ from ccd_casadi.codesign.lifted_kkt import (
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim.quadratic_programmes import damped_bfgs
-from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, Step, TrustRegionModel, minimise
+from ccd_casadi.optim.step import Iterate, Rows, Step, TrustRegionModel
+from ccd_casadi.optim.trust_region import Radius, minimise
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.time_budget import not_searched, time_is_up
 

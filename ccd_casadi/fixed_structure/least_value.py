@@ -47,7 +47,7 @@ from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.optim.trust_region import Iterate
+from ccd_casadi.optim.step import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers, results

@@ -11,15 +11,8 @@ from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.optim.quadratic_programmes import symmetric_rank_one
-from ccd_casadi.optim.trust_region import (
-    Data,
-    Iterate,
-    Radius,
-    Rows,
-    Step,
-    TrustRegionModel,
-    minimise,
-)
+from ccd_casadi.optim.step import Data, Iterate, Rows, Step, TrustRegionModel
+from ccd_casadi.optim.trust_region import Radius, minimise
 from ccd_casadi.support.arrays import Array
 
 Goal = Callable[[Array], tuple[float, Array]]

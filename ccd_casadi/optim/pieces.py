@@ -12,15 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ccd_casadi.optim.quadratic_programmes import damped_bfgs
-from ccd_casadi.optim.trust_region import (
-    Iterate,
-    Radius,
-    Rows,
-    Step,
-    TrustRegionModel,
-    best_step,
-    minimise,
-)
+from ccd_casadi.optim.step import Iterate, Rows, Step, TrustRegionModel, best_step
+from ccd_casadi.optim.trust_region import Radius, minimise
 from ccd_casadi.support.arrays import Array
 
 

@@ -9,16 +9,8 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.optim.quadratic_programmes import QuadraticOptions, damped_bfgs, symmetric_rank_one
-from ccd_casadi.optim.trust_region import (
-    Iterate,
-    Minimum,
-    Radius,
-    Rows,
-    Step,
-    TrustRegionModel,
-    best_step,
-    minimise,
-)
+from ccd_casadi.optim.step import Iterate, Rows, Step, TrustRegionModel, best_step
+from ccd_casadi.optim.trust_region import Minimum, Radius, minimise
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
