@@ -221,7 +221,7 @@ class _CurvedRows:
         offset[self.bending] -= 0.5 * bend @ p
         return A, offset
 
-    def bent_along(self, way: Array, offset: Array) -> Array:
+    def curved_along(self, way: Array, offset: Array) -> Array:
         """An offset, with what the rows bend along a way from where they are linear."""
         found = offset.copy()
         found[self.bending] += 0.5 * (self.hessians @ way) @ way
@@ -234,7 +234,7 @@ class _CurvedRows:
 
 
 @dataclass(frozen=True)
-class _Programme:
+class _StepProgramme:
     """A quadratic programme of a step around p, with rows A p + offset <= σ.
 
     Attributes
@@ -289,7 +289,7 @@ def best_step(
     weight = options.elastic_penalty * (unit + penalty) if model.growing else penalty
     low, high = ends_of_step(model, here, radius)
 
-    def solution(at: _Programme, offset: Array) -> tuple[Array, Array] | None:
+    def solution(at: _StepProgramme, offset: Array) -> tuple[Array, Array] | None:
         cost = here.gradient + (H - at.M) @ at.p
         ends = np.maximum(low, at.p - at.near), np.minimum(high, at.p + at.near)
         return solve_elastic(at.M, cost, at.A, offset, curved.elastic, *ends, weight, radius, unit,
@@ -303,7 +303,7 @@ def best_step(
 
     margin = 0.0 if rows.margin is None else rows.margin[chosen]
     M = convex(H, options.flat * unit)
-    at = _Programme(np.zeros(len(here.x)), radius, M, curved.slopes, curved.value + margin)
+    at = _StepProgramme(np.zeros(len(here.x)), radius, M, curved.slopes, curved.value + margin)
     best, straight = None, 0.0
     for turn in range(options.programmes):
         if (found := solution(at, at.offset)) is None:
@@ -325,7 +325,7 @@ def best_step(
         tried = at.p + shares[:, None] * way
         known, *reached = gains(np.vstack([at.p, tried])).tolist()
         if turn and reached[0] < max(reached):
-            other = solution(at, curved.bent_along(way, at.offset))
+            other = solution(at, curved.curved_along(way, at.offset))
             if other is not None:
                 tried = np.vstack([tried, other[0]])
                 reached += gains(other[0][None]).tolist()
@@ -366,7 +366,7 @@ def _rows_in_reach(
 
 
 def _rows_to_bend(
-    model: TrustRegionModel[Data], curved: _CurvedRows, at: _Programme, w: Array,
+    model: TrustRegionModel[Data], curved: _CurvedRows, at: _StepProgramme, w: Array,
     holds: np.ndarray, known: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """The rows whose Hessians are `known` and not used yet: they hold w, or are so near to their
