@@ -24,8 +24,7 @@ from ccd_casadi.codesign.verdict import (
     between_finding,
     survives,
 )
-from ccd_casadi.extensions.drives.drive_case import DriveProblem
-from ccd_casadi.extensions.drives.drive_codesign import meets_constraints
+from ccd_casadi.extensions.drives.drive_case import DriveProblem, meets_constraints
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.two_rates import LiftedLoop, lift, place_name
 from ccd_casadi.fixed_structure.certificate import SetCertificate
