@@ -67,23 +67,13 @@ class ConcernOptions:
         Of a step without feedforward.
     between_lines : float
         What |S| may reach between the lines of a response, over the largest on them.
+    identified : float
+        Relative: how well resonances are known where nothing else is stated.
     """
 
     slack: float = 0.01
     overshoot: float = 0.5
     between_lines: float = 1.1
-
-
-@dataclass(frozen=True)
-class ConditionOptions:
-    """Numbers of the conditions.
-
-    Attributes
-    ----------
-    identified : float
-        Relative: how well resonances are known where nothing else is stated.
-    """
-
     identified: float = 0.05
 
 
@@ -123,7 +113,7 @@ def _move(result: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def resonance_condition(
-    result: Mapping[str, Any], *, options: ConditionOptions = ConditionOptions()
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> str:
     """How well the resonances have to be known, where no set of the case holds such an error.
 
@@ -131,7 +121,7 @@ def resonance_condition(
     ----------
     result : mapping
         Of result.json.
-    options : ConditionOptions
+    options : ConcernOptions
 
     Returns
     -------

@@ -194,7 +194,8 @@ class SampledModel:
 
     @cached_property
     def polynomials(self) -> tuple[Array, Array]:
-        """K with its coefficients as the drive rounds them."""
+        """Coefficients' own (m + 1, ..., 1 + 2p, n + 1) in powers of t, the parameters over their
+        half widths about the middle, and bounds (1 + 2p, n + 1) of the error."""
         o, (low, high) = self.options, self.uncertain.box
         m, count = o.degree, len(low)
         t = np.cos(np.pi * (np.arange(m + 1) + 0.5) / (m + 1))

@@ -219,19 +219,6 @@ def with_lines_near(
 
 
 @dataclass(frozen=True)
-class PresentOptions:
-    """Numbers of the reading of a controller.
-
-    Attributes
-    ----------
-    at_rest : float
-        Size of a pole over the fastest below which it is an integrator.
-    """
-
-    at_rest: float = 1e-6
-
-
-@dataclass(frozen=True)
 class PresentLoop:
     """The loop of the present controller, the worst of several responses.
 
@@ -258,9 +245,8 @@ class PresentLoop:
 
 
 def present_loop(
-    path: Path, responses: Sequence[MeasuredResponse], bounds: Bounds, period: float | None,
-    options: PresentOptions = PresentOptions(),
-) -> PresentLoop:  # fmt: skip
+    path: Path, responses: Sequence[MeasuredResponse], bounds: Bounds, period: float | None
+) -> PresentLoop:
     """Judge the controller of a file on responses as they were measured, without their spread.
 
     Parameters
@@ -270,7 +256,6 @@ def present_loop(
     responses, bounds : sequence of MeasuredResponse, Bounds
     period : float or None
         s; a continuous controller runs by Tustin's rule.
-    options : PresentOptions
 
     Returns
     -------
@@ -291,14 +276,14 @@ def present_loop(
                         f"{1.0 / period:.6g} Hz; give the continuous one")  # fmt: skip
     plain = [replace(one, spread=None) for one in responses]
     found = judge(plain, K, replace(bounds, shape=None), period=None if K.period else period,
-                  integrator=_integrates(K, options))  # fmt: skip
+                  integrator=_integrates(K))  # fmt: skip
     peak_hz = found.S_peak_frequency / HZ
     return PresentLoop(found.stable, found.bandwidth / HZ, found.S_peak, peak_hz)
 
 
-def _integrates(K: StateSpace, options: PresentOptions) -> bool:
-    """Whether K has a pole at rest."""
+def _integrates(K: StateSpace, *, at_rest: float = 1e-6) -> bool:
+    """Whether K has a pole at rest: smaller than the fastest by the factor `at_rest`."""
     if not len(K.A):
         return False
     rates = np.abs(K.poles - 1.0) if K.period else np.abs(K.poles)
-    return bool(rates.min() <= options.at_rest * max(float(rates.max()), 1e-300))
+    return bool(rates.min() <= at_rest * max(float(rates.max()), 1e-300))

@@ -1,4 +1,4 @@
-"""The plant's response from a record of a loop: by the excitation as the instrument.
+"""The plant's response from records of a loop: by the excitation as the instrument.
 
 With the excitation r (a force that is injected, or the reference) as the instrument
 
@@ -14,14 +14,13 @@ differences: these do not change G, and make of a drift an offset and of a step 
 is the variance of Ĝ with ν degrees of freedom, and the radius of the disc about Ĝ that holds G with
 the stated probability, at each line alone.
 
-The response of a plant with several forces and positions, from one record or more a force.
-
-In record i the excitation r_i drives all forces u and positions y of the loop. With the responses
-Y = [G_yr1 G_yr2 …] and U = [G_ur1 G_ur2 …] of all records, each with its covariance C_i,
+Of several forces and positions there is one record or more a force. In record i the excitation r_i
+drives all forces u and positions y of the loop. With the responses Y = [G_yr1 G_yr2 …] and
+U = [G_ur1 G_ur2 …] of all records, each with its covariance C_i,
 
     G = Y U⁺,     var G_ab = Σ_i ([I -G] C_i [I -G]ᴴ)_aa |U⁺_ib|²,
 
-as for one channel (`plant_estimate`); the spread is that of each entry.
+as for one channel; the spread is that of each entry.
 """
 
 from collections.abc import Sequence
@@ -66,6 +65,9 @@ class EstimateOptions:
         |G_ur| below which an injected force is not in the force.
     drift : float
         Offset between the ends of a record over the range of the position from which it is named.
+    alike : float
+        Of several channels: least singular value of U over the largest, below which two records
+        excite alike.
     """
 
     confidence: float = 0.95
@@ -79,6 +81,7 @@ class EstimateOptions:
     most_periods: int = 64
     through: float = 0.5
     drift: float = 0.02
+    alike: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -281,19 +284,6 @@ def _period(excitation: Array, options: EstimateOptions) -> int:
 
 
 @dataclass(frozen=True)
-class ChannelOptions:
-    """Numbers of the estimate of several channels.
-
-    Attributes
-    ----------
-    apart : float
-        Least singular value of U over the largest: below it two records excite alike.
-    """
-
-    apart: float = 1e-3
-
-
-@dataclass(frozen=True)
 class MatrixEstimate:
     """A plant's response by records of several channels.
 
@@ -320,16 +310,15 @@ def read_channels(
 
 
 def estimate_channels(
-    records: Sequence[list[list[TimeSeries]]], options: EstimateOptions = EstimateOptions(),
-    channels: ChannelOptions = ChannelOptions(),
-) -> MatrixEstimate:  # fmt: skip
+    records: Sequence[list[list[TimeSeries]]], options: EstimateOptions = EstimateOptions()
+) -> MatrixEstimate:
     """Estimate the response of all forces to all positions.
 
     Parameters
     ----------
     records : sequence of lists of TimeSeries
         As `read_channels` gives them, at least one a force, of unlike excitations.
-    options, channels : EstimateOptions, ChannelOptions
+    options : EstimateOptions
 
     Returns
     -------
@@ -362,7 +351,7 @@ def estimate_channels(
             for part in (slice(None, p), slice(p, None)))  # fmt: skip
     good = np.isfinite(Y).all(axis=(1, 2)) & np.isfinite(U).all(axis=(1, 2))
     size = np.linalg.svd(np.where(good[:, None, None], U, 0.0), compute_uv=False)
-    unlike = size[:, m - 1] > channels.apart * size[:, 0]
+    unlike = size[:, m - 1] > options.alike * size[:, 0]
     if not (good & unlike).any():
         raise UserError("two records excite the forces alike; inject at another force in each")
     kept = np.flatnonzero(good & unlike)
