@@ -18,35 +18,19 @@ from ccd_casadi.support.text import spoken, with_unit
 
 @dataclass(frozen=True)
 class ResponseSumOptions:
-    """Numbers of a sum over an impulse response.
+    """Numbers of a sum over an impulse response."""
 
-    Attributes
-    ----------
-    block : int
-        Samples at once.
-    share : float
-        Of the sum, that the rest may be.
-    most : int
-        Blocks at most; beyond them nothing is known.
-    """
-
-    block: int = 256
-    share: float = 1e-3
-    most: int = 20_000
+    block: int = 256  # samples at once
+    share: float = 1e-3  # of the sum, that the rest may be
+    most: int = 20_000  # blocks at most; beyond them nothing is known
 
 
 @dataclass(frozen=True)
 class RoundingBound:
-    """What rounding adds.
+    """What rounding adds."""
 
-    Attributes
-    ----------
-    bits, errors : int, array (p,)
-        Of a word; largest movement of each sensor, its unit. Infinite where it is not known.
-    """
-
-    bits: int
-    errors: Array
+    bits: int  # of a word
+    errors: Array  # (p,) largest movement of each sensor, its unit; infinite where not known
 
     @property
     def largest(self) -> float:

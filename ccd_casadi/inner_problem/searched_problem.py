@@ -18,18 +18,10 @@ Scenario = tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True)
 class WarmStartOptions:
-    """How many warm starts a state keeps.
+    """How many warm starts a state keeps."""
 
-    Attributes
-    ----------
-    found : int
-        Of a multi-start search.
-    kept : int
-        With one that is added.
-    """
-
-    found: int = 3
-    kept: int = 4
+    found: int = 3  # of a multi-start search
+    kept: int = 4  # with one that is added
 
 
 @dataclass(frozen=True)

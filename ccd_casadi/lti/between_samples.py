@@ -32,21 +32,11 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class BetweenOptions:
-    """Numbers of the search between the samples.
+    """Numbers of the search between the samples."""
 
-    Attributes
-    ----------
-    times : int
-        Of a period at which S_τ is evaluated, evenly spread from the instant on.
-    near : float
-        Share of the largest value: lower local maxima are not refined.
-    plants : int
-        Of a set: those with the largest peaks at the instants.
-    """
-
-    times: int = 8
-    near: float = 0.9
-    plants: int = 12
+    times: int = 8  # of a period at which S_τ is evaluated, evenly spread from the instant on
+    near: float = 0.9  # share of the largest value: lower local maxima are not refined
+    plants: int = 12  # of a set: those with the largest peaks at the instants
 
 
 @dataclass(frozen=True)

@@ -67,21 +67,12 @@ FORMS = {
 
 @dataclass(frozen=True)
 class Filter:
-    """One filter of a drive.
-
-    Attributes
-    ----------
-    form : Form
-    rule : Rule
-    number : Number
-    period : float
-        T, s.
-    """
+    """One filter of a drive."""
 
     form: Form
     rule: Rule
     number: Number
-    period: float
+    period: float  # T, s
     of_fixed: ClassVar[float] = 2.0**30  # that many steps in one
     largest_fixed: ClassVar[float] = 2.0  # 32 bits with a sign
 

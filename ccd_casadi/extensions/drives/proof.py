@@ -74,22 +74,12 @@ class ModelOptions:
 
 @dataclass(frozen=True)
 class SampledModel:
-    """One option of an uncertain plant, time in 1/`unit`.
-
-    Attributes
-    ----------
-    uncertain : UncertainPlant
-    option : int
-    sampling : Sampling
-    unit : float
-        rad/s.
-    options : ModelOptions
-    """
+    """One option of an uncertain plant, time in 1/`unit`."""
 
     uncertain: UncertainPlant
     option: int
     sampling: Sampling
-    unit: float
+    unit: float  # rad/s
     options: ModelOptions = field(default_factory=ModelOptions)
 
     @cached_property

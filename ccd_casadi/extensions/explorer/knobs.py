@@ -161,29 +161,14 @@ class Notch:
 
 @dataclass(frozen=True)
 class Notched:
-    """The loop that is drawn, with a notch: recomputed from controller and plant.
-
-    Attributes
-    ----------
-    notch : Notch
-    stable : bool
-        By the poles of the closed loop, hold and delay exact.
-    hz : (k,) array
-        The page's frequencies, and those around the notch, Hz.
-    open : (k, p, p) array
-        L.
-    gain : (k,) array
-        σ_max(S).
-    margins : ClassicalMargins
-        The least.
-    """
+    """The loop that is drawn, with a notch: recomputed from controller and plant."""
 
     notch: Notch
-    stable: bool
-    hz: Array
-    open: np.ndarray
-    gain: Array
-    margins: ClassicalMargins
+    stable: bool  # by the poles of the closed loop, hold and delay exact
+    hz: Array  # (k,) the page's frequencies, and those around the notch, Hz
+    open: np.ndarray  # (k, p, p) L
+    gain: Array  # (k,) σ_max(S)
+    margins: ClassicalMargins  # the least
 
     @property
     def bandwidth_hz(self) -> float:

@@ -238,18 +238,10 @@ def improved(
 
 @dataclass(frozen=True)
 class FeedforwardPageOptions:
-    """Numbers of the page.
+    """Numbers of the page."""
 
-    Attributes
-    ----------
-    shown : int
-        Plants of which a curve is drawn.
-    least : float
-        Of the window: a smaller error is drawn there.
-    """
-
-    shown: int = 12
-    least: float = 1e-3
+    shown: int = 12  # plants of which a curve is drawn
+    least: float = 1e-3  # of the window: a smaller error is drawn there
 
 
 def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -> c.Page:

@@ -58,39 +58,20 @@ class LeastTimeOptions:
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """What the motors may do in a move.
+    """What the motors may do in a move."""
 
-    Attributes
-    ----------
-    peak : float
-        u_max of any motor, N.
-    heat : float
-        E, N² s.
-    """
-
-    peak: float
-    heat: float
+    peak: float  # u_max of any motor, N
+    heat: float  # E, N² s
 
 
 @dataclass(frozen=True)
 class LeastTime:
-    """What a search found.
+    """What a search found."""
 
-    Attributes
-    ----------
-    x : (c,) array
-        Coefficients, as of `shape`.
-    shape : Shape
-    time : float
-        From which on all plants of the design are within the window less its margin, s.
-    left : float
-        s(t): the largest error from then on, over the window.
-    """
-
-    x: Array
+    x: Array  # (c,) coefficients, as of `shape`
     shape: Shape
-    time: float
-    left: float
+    time: float  # from which on all plants of the design are within the window less its margin, s
+    left: float  # s(t): the largest error from then on, over the window
 
 
 class _Programme:

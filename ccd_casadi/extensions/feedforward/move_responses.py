@@ -37,24 +37,12 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class Shape:
-    """Which coefficients there are.
+    """Which coefficients there are."""
 
-    Attributes
-    ----------
-    orders : tuple of int
-        Derivatives of the setpoint that have a force.
-    forces : int
-        m, of the plant.
-    taps : int
-        Of every signal, the first without delay.
-    spacing : int
-        d, samples from tap to tap.
-    """
-
-    orders: tuple[int, ...]
-    forces: int
-    taps: int = 1
-    spacing: int = 1
+    orders: tuple[int, ...]  # derivatives of the setpoint that have a force
+    forces: int  # m, of the plant
+    taps: int = 1  # of every signal, the first without delay
+    spacing: int = 1  # d, samples from tap to tap
 
     @property
     def count(self) -> int:
@@ -82,24 +70,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class MoveResponses:
-    """One plant's move, by coefficients of one tap.
+    """One plant's move, by coefficients of one tap."""
 
-    Attributes
-    ----------
-    period : float
-        T, s.
-    reached : (N, q, c) array
-        What counts, per coefficient, unit of y; the first is of the setpoint itself.
-    force : (N, m, c) array
-        N.
-    setpoint : (N, q) array
-        What is wanted of that without a shaper; the last is where the move ends.
-    """
-
-    period: float
-    reached: Array
-    force: Array
-    setpoint: Array
+    period: float  # T, s
+    reached: Array  # (N, q, c) what counts, per coefficient, unit of y; the setpoint's first
+    force: Array  # (N, m, c) N
+    setpoint: Array  # (N, q) wanted of it without a shaper; the last is where the move ends
 
     @property
     def end(self) -> Array:

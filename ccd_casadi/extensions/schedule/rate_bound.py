@@ -143,25 +143,13 @@ def borders(segments: Sequence[Segment]) -> list[Border]:
 
 @dataclass(frozen=True)
 class RateBound:
-    """The allowed rate of p.
+    """The allowed rate of p."""
 
-    Attributes
-    ----------
-    rate : float
-        r, unit of p per second; 0: none.
-    positions : int
-        N.
-    part, at : int, float or None
-        That set it: the part, from 0, and where it hands over; None: V stops falling inside.
-    waits : tuple of float
-        Of each part, s: it keeps control for so long at least.
-    """
-
-    rate: float
-    positions: int
-    part: int
-    at: float | None
-    waits: tuple[float, ...]
+    rate: float  # r, unit of p per second; 0: none
+    positions: int  # N
+    part: int  # that set it, from 0
+    at: float | None  # where it hands over; None: V stops falling inside
+    waits: tuple[float, ...]  # of each part, s: it keeps control for at least as long
 
 
 def rate_bound(

@@ -44,20 +44,11 @@ CODE = ("schedule.h", "schedule.c")
 
 @dataclass(frozen=True)
 class FrozenPosition:
-    """A position at rest, with each part that may control there.
-
-    Attributes
-    ----------
-    at : float
-    failed : tuple of int
-        Parts, from 0, that exceed a bound on a plant of the set there.
-    bandwidth : float
-        On the model there, the slowest of the parts, rad/s.
-    """
+    """A position at rest, with each part that may control there."""
 
     at: float
-    failed: tuple[int, ...]
-    bandwidth: float
+    failed: tuple[int, ...]  # parts, from 0, that exceed a bound on a plant of the set there
+    bandwidth: float  # on the model there, the slowest of the parts, rad/s
 
     @property
     def passed(self) -> bool:

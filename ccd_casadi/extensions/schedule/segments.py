@@ -83,18 +83,10 @@ class DesignedPart:
 
 @dataclass(frozen=True)
 class Segment(DesignedPart):
-    """A part that was judged.
+    """A part that was judged."""
 
-    Attributes
-    ----------
-    judgement : Judgement
-        On plants of the part.
-    proof : Proof
-        On all of the part.
-    """
-
-    judgement: Judgement
-    proof: Proof
+    judgement: Judgement  # on plants of the part
+    proof: Proof  # on all of the part
 
     @property
     def passed(self) -> bool:

@@ -45,21 +45,12 @@ from ccd_casadi.support.time_budget import within_budget
 
 @dataclass(frozen=True)
 class ToleranceCase:
-    """A case with the problem of its whole box.
-
-    Attributes
-    ----------
-    case, problem : Case, CoDesignProblem
-    plan : Plan or None
-        Of its share, where it has one.
-    distribution : mapping
-        By tolerance; uniform where it has none.
-    """
+    """A case with the problem of its whole box."""
 
     case: Case
     problem: CoDesignProblem
-    plan: Plan | None
-    distribution: Mapping[str, str]
+    plan: Plan | None  # of its share, where it has one
+    distribution: Mapping[str, str]  # by tolerance; uniform where it has none
 
 
 def tolerance_case(case: Case) -> ToleranceCase:
@@ -129,44 +120,22 @@ def _require_known(
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command ends with.
+    """What a command ends with."""
 
-    Attributes
-    ----------
-    entry : dict
-        Of tolerances.json.
-    words : tuple of str
-        Lines for the terminal.
-    good : bool
-        Whether what is required is shown.
-    files : dict
-        Content of further files by name: JSON values, or text.
-    """
-
-    entry: dict[str, Any]
-    words: tuple[str, ...]
-    good: bool
-    files: dict[str, Any]
+    entry: dict[str, Any]  # of tolerances.json
+    words: tuple[str, ...]  # lines for the terminal
+    good: bool  # whether what is required is shown
+    files: dict[str, Any]  # content of further files by name: JSON values, or text
 
 
 @dataclass(frozen=True)
 class ShareDesign:
-    """A design for a share of machines, judged.
+    """A design for a share of machines, judged."""
 
-    Attributes
-    ----------
-    whole : SectionsDesign or None
-        For the whole box at `whole_theta`; None where there is none.
-    search : ShareSearch
-    design : SectionsDesign
-        Certified anew on its working set.
-    certificate : ShareCertificate
-    """
-
-    whole: SectionsDesign | None
+    whole: SectionsDesign | None  # for the whole box at `whole_theta`; None where there is none
     whole_theta: tuple[float, ...]
     search: ShareSearch
-    design: SectionsDesign
+    design: SectionsDesign  # certified anew on its working set
     certificate: ShareCertificate
 
 

@@ -160,37 +160,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class ShareCertificateOptions:
-    """Numbers of the certificate.
+    """Numbers of the certificate."""
 
-    Attributes
-    ----------
-    batch : int
-        Machines that are judged at once.
-    seed : int
-        Beside the run's: no search draws with it.
-    """
-
-    batch: int = 250
-    seed: int = 5000
+    batch: int = 250  # machines that are judged at once
+    seed: int = 5000  # beside the run's: no search draws with it
 
 
 @dataclass(frozen=True)
 class ShareCertificate:
-    """How many fresh machines keep every bound.
+    """How many fresh machines keep every bound."""
 
-    Attributes
-    ----------
-    plan : Plan
-        The share, its confidence, and the number of draws.
-    failed : int
-        Of these.
-    not_evaluated : int
-        Of those that failed: where the evaluation raised.
-    """
-
-    plan: Plan
-    failed: int
-    not_evaluated: int = 0
+    plan: Plan  # the share, its confidence, and the number of draws
+    failed: int  # of these
+    not_evaluated: int = 0  # of those that failed: where the evaluation raised
 
     @property
     def least(self) -> float:
