@@ -239,16 +239,7 @@ numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
 def by_name(item: KeyCheck) -> KeyCheck:
-    """Make the check of a table whose values all pass a check.
-
-    Parameters
-    ----------
-    item : KeyCheck
-
-    Returns
-    -------
-    KeyCheck
-    """
+    """Make the check of a table whose values all pass a check."""
 
     def check(value: Any) -> str | None:
         if not isinstance(value, Mapping) or not value:

@@ -118,16 +118,7 @@ def unit_findings(
 
 
 def states_effort(problem: CoDesignProblem) -> bool:
-    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours."""
     kind = kind_of(problem)
     return not kind.as_designed or kind.bounds().weighted_level is not None
 
@@ -278,19 +269,8 @@ def plausibility_findings(
     *,
     options: PlausibilityOptions = PlausibilityOptions(),
 ) -> list[CaseFinding]:
-    """Ask about a motor, a move and S_low of a problem that hardly any machine has.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    facts : PlantFacts
-        At the start.
-    options : PlausibilityOptions
-
-    Returns
-    -------
-    list of CaseFinding
-        Warnings.
+    """Ask about a motor, a move and S_low of a problem that hardly any machine has; facts at the
+    start.
     """
     words = _low_words(problem, facts, options)
     if (motion := problem.source.motion) is not None:

@@ -203,25 +203,10 @@ def in_fixed(
     realisation: Realisation, ranges: Ranges, request: FixedRequest,
     options: FixedOptions = FixedOptions(),
 ) -> Realisation:  # fmt: skip
-    """Give a realisation in double precision its integers.
+    """The realisation with its integers, `system` and back-calculation as these are.
 
-    Parameters
-    ----------
-    realisation : Realisation
-    ranges : Ranges
-        Without headroom.
-    request : FixedRequest
-    options : FixedOptions
-
-    Returns
-    -------
-    Realisation
-        Its `system` and back-calculation are those of the integers.
-
-    Raises
-    ------
-    UserError
-        A step of the electronics is too fine for the range.
+    `realisation` is in double precision, `ranges` are without headroom. Raises UserError where a
+    step of the electronics is too fine for the range.
     """
     K, L, most = realisation.as_coded, realisation.back_calculation, 2 ** (request.bits - 1) - 1
     n, p, m = len(K.A), K.B.shape[1], len(K.C)

@@ -44,20 +44,8 @@ def ranges_of_moves(
 ) -> Ranges:  # fmt: skip
     """Largest values in moves of every axis, with feedforward where there is one and without.
 
-    Parameters
-    ----------
-    plant, held : StateSpace
-        u to y in SI, and the same behind hold and delay.
-    K : StateSpace
-        As it runs, SI.
-    profile : Setpoint
-    forward : (5, m, p) array or None
-    places : sequence of BreakPoint
-        Of several sensors on one actuator.
-
-    Returns
-    -------
-    Ranges
+    `plant` is from u to y in SI, `held` the same behind hold and delay, `K` as it runs; `forward`
+    is (5, m, p), `places` are of several sensors on one actuator.
     """
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     count = int(np.ceil(2.0 * profile.duration / held.period))
@@ -81,20 +69,7 @@ def ranges_of_moves(
 def forward_gains(
     forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
 ) -> Array:
-    """Feedforward of a setpoint's position and derivatives.
-
-    Parameters
-    ----------
-    forward : (5, m, p) array
-    reference : array (p,)
-        As of `course`.
-    axis : int
-    places : sequence of BreakPoint
-
-    Returns
-    -------
-    array (5, m)
-    """
+    """Feedforward (5, m) of a setpoint's derivatives; `reference` (p,) as of `course`."""
     return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 

@@ -43,23 +43,11 @@ FUNCTIONS = {1: "time responses", 2: "auto spectra", 3: "cross spectra", 6: "coh
 def columns_of_universal(
     path: Path, codes: DatasetCodes = DatasetCodes()
 ) -> tuple[list[TableColumn], list[str]]:
-    """Read the only frequency response of a universal file.
+    """Read the only frequency response of a universal file: f_hz, G with its unit, what is to be
+    reported.
 
-    Parameters
-    ----------
-    path : Path
-    codes : DatasetCodes
-
-    Returns
-    -------
-    list of TableColumn, list of str
-        f_hz and G with its unit, and what is to be reported.
-
-    Raises
-    ------
-    UserError
-        pyuff is not installed, or the file holds no single response over a force that is
-        understood.
+    Raises UserError where pyuff is not installed, or the file holds no single response over a force
+    that is understood.
     """
     pyuff = require("pyuff", "uff")
     if not path.exists():

@@ -170,20 +170,8 @@ def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def requirement_words(
     one: Mapping[str, Any], *, digits: int = 5, least: float = 1e-6
 ) -> tuple[str, str]:
-    """What is required and what is achieved, in the unit that an engineer would read it in.
-
-    Parameters
-    ----------
-    one : mapping
-        An entry of `requirements` in result.json.
-    digits : int
-        Significant ones.
-    least : float
-        A constraint on θ that misses 0 by less, the solver's rounding, is 0.
-
-    Returns
-    -------
-    required, achieved : str
+    """What is required and achieved of an entry of `requirements` in result.json, in the unit that
+    an engineer would read it in; a constraint on θ that misses 0 by less than `least` is 0.
     """
     required, achieved = one["required"], one["achieved"]
     units = {"compliance_max": spoken("m/N"), "bandwidth_least_hz": "Hz"}

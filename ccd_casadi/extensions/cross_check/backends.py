@@ -256,18 +256,8 @@ def verdicts(
         γ > (1 + agree) γ_least       certified, but above the least
         otherwise                     right
 
-    with γ_jω of the package's own design and γ_least the least certified γ that is not wrong.
-
-    Parameters
-    ----------
-    results : sequence of BackendResult
-        That of "riccati" among them.
-    options : BackendOptions
-
-    Returns
-    -------
-    list of BackendResult
-        With `holds` and `words`; those without a design as they are.
+    with γ_jω of the package's own design ("riccati") and γ_least the least certified γ that is not
+    wrong. Those without a design are returned as they are.
     """
     ours = next(item for item in results if item.backend == RICCATI)
     bound = math.nan if ours.design is None else ours.design.figures.gamma_lower_bound

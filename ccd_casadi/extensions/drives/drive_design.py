@@ -148,28 +148,9 @@ def design_drive(
 ) -> DriveDesign:  # fmt: skip
     """Find the fastest rounded cascade.
 
-    Parameters
-    ----------
-    cascade, uncertain, bounds, sampling : Cascade, UncertainPlant, Bounds, Sampling
-    seed : int
-    workers : Pool, optional
-        For the judge.
-    progress : callable
-        Takes a line at each step.
-    options : DriveOptions
-    near : Candidate, optional
-        From which the search climbs, instead of many starts.
-    ported : UncertainPlant, optional
-        The same with its ports, where compliance_max bounds what a force moves.
-
-    Returns
-    -------
-    DriveDesign
-
-    Raises
-    ------
-    UserError
-        No start is stable within the drive's limits, or none meets the bounds.
+    `near` is where the search climbs from, instead of many starts; `ported` the same plants with
+    their ports, where compliance_max bounds what a force moves; the workers are the judge's. Raises
+    UserError where no start is stable within the drive's limits, or none meets the bounds.
     """
     require_known(cascade, bounds)
     if cascade.slower > 1:

@@ -211,19 +211,8 @@ class Notched:
 
 
 def notched(view: LoopView, notch: Notch, options: NotchOptions = NotchOptions()) -> Notched:
-    """Judge a loop with a notch behind its controller.
-
-    Parameters
-    ----------
-    view : LoopView
-        The loop without it, on the page's frequencies.
-    notch : Notch
-    options : NotchOptions
-        How far around it is looked.
-
-    Returns
-    -------
-    Notched
+    """Judge a loop with a notch behind its controller; `view`: without it, on the page's
+    frequencies.
     """
     loop = replace(view.loop, controller=notch.behind(view.loop.controller))
     reach = np.exp(options.beside * notch.damping * np.linspace(-1.0, 1.0, 41))

@@ -153,25 +153,9 @@ def least_time(
 ) -> LeastTime | None:
     """Find the coefficients with which the latest plant settles at the earliest.
 
-    Parameters
-    ----------
-    plants : sequence of MoveResponses
-        Of one tap.
-    shape : Shape
-        Of the coefficients.
-    window : float
-        w, unit of y.
-    limits : ForceLimits
-    latest : float
-        A time that is known to be late enough, or where the search ends, s.
-    start : (c,) array
-        Coefficients whose largest errors are the first rows.
-    options : LeastTimeOptions
-
-    Returns
-    -------
-    LeastTime or None
-        None: not even by `latest`.
+    Plants are of one tap, `window` is w in the unit of y. `latest` is a time in s that is known to
+    be late enough, or where the search ends; `start` (c,) are coefficients whose largest errors are
+    the first rows. None: not even by `latest`.
     """
     shaped, period = [one.shaped(shape) for one in plants], plants[0].period
     move = float(np.abs(plants[0].end).max())

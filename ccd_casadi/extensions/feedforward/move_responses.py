@@ -129,27 +129,11 @@ def _later(signal: Array, samples: int) -> Array:
 def responses_of(
     loop: Loop, profile: Setpoint, orders: tuple[int, ...], *, axis: int, samples: int
 ) -> MoveResponses:
-    """Respond to a setpoint and to a force of each of its derivatives at each motor.
+    """Respond with N samples to a setpoint and to a force of each of its derivatives at each motor.
 
-    Parameters
-    ----------
-    loop : Loop
-        Closed, sampled, SI.
-    profile : Setpoint
-        Of the output `axis`; the others stay at 0.
-    orders : tuple of int
-        Derivatives that have a force.
-    axis, samples : int
-        From 0; N.
-
-    Returns
-    -------
-    MoveResponses
-
-    Raises
-    ------
-    UserError
-        The loop is continuous, or not stable.
+    `loop` is closed, sampled and in SI, `profile` of the output `axis` (from 0); the others stay at
+    0. `orders` are the derivatives that have a force. Raises UserError where the loop is
+    continuous, or not stable.
     """
     if loop.sampling is None:
         raise UserError("feedforward: needs a sampled loop; deploy it, and give --controller")
@@ -180,18 +164,8 @@ def responses_of(
 
 
 def learning_gain(model: MoveResponses, shape: Shape) -> Array:
-    """Ψ⁺, from the error of a move to what is added to the forces of the coefficients.
-
-    Parameters
-    ----------
-    model : MoveResponses
-        Of the model, with all taps.
-    shape : Shape
-
-    Returns
-    -------
-    (c, N q) array
-        For the forces of the first tap.
+    """Ψ⁺ (c, N q), from the error of a move to what is added to the forces of the first tap;
+    `model` has all taps.
     """
     psi = _first(model, shape)
     size = np.abs(psi).max(axis=0)  # derivatives of the setpoint differ by many decades
@@ -206,18 +180,8 @@ def learned(x: Array, error: Array, gain: Array, shape: Shape) -> Array:
 
 
 def contraction(plants: Sequence[MoveResponses], gain: Array, shape: Shape) -> float:
-    """ρ, the largest of all plants: less than 1 where learning converges on each.
-
-    Parameters
-    ----------
-    plants : sequence of MoveResponses
-        With all taps.
-    gain : (c, N q) array
-    shape : Shape
-
-    Returns
-    -------
-    float
+    """ρ, the largest of all plants: less than 1 where learning converges on each; all taps, `gain`
+    (c, N q).
     """
     one = np.eye(len(gain))
     return max(float(np.abs(np.linalg.eigvals(one - gain @ _first(plant, shape))).max())

@@ -138,26 +138,9 @@ def set_feedforward(
 ) -> SetFeedforward:
     """Find the feedforward, and at most `taps` taps of the shaper, for the set of a run.
 
-    Parameters
-    ----------
-    run : FinishedRun
-        With a sampled loop.
-    profile : Setpoint
-        Of the output `axis`, from 0.
-    window : float
-        In which the move has settled, unit of y.
-    axis, taps, seed : int
-        Of the plants that are drawn.
-    options : FeedforwardSetOptions
-
-    Returns
-    -------
-    SetFeedforward
-
-    Raises
-    ------
-    UserError
-        The loop is continuous, or no coefficients settle on all plants.
+    `profile` is of the output `axis` (from 0), `window` that in which the move has settled, in the
+    unit of y; `seed` is of the plants that are drawn. Raises UserError where the loop is
+    continuous, or no coefficients settle on all plants.
     """
     model, orders, inverse = _inverse(run, axis)
     plants = [model, *(member.plant.plant_si() for member in members(run, dense=True))]

@@ -87,28 +87,11 @@ class BandwidthGap:
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> BandwidthGap:
-    """The bound on every controller at θ.
+    """The bound in rad/s on every controller at θ (SI), of a problem with a fixed structure.
 
-    On the model it holds for every set that has the model in it.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-        With controllers of fixed structure.
-    theta : (n_θ,) sequence
-        SI.
-    within : bool
-        Whether to bound it on the model from both sides too, of one channel.
-
-    Returns
-    -------
-    BandwidthGap
-        rad/s.
-
-    Raises
-    ------
-    UserError
-        The problem is of another kind.
+    On the model it holds for every set that has the model in it; `within`: whether to bound it
+    there from both sides too, of one channel. Raises UserError where the problem is of another
+    kind.
     """
     loops = sorted(limits_of_problem(problem, theta), key=pointwise)
     if loops[0].name:

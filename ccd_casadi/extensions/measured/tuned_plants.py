@@ -249,22 +249,9 @@ def present_loop(
 ) -> PresentLoop:
     """Judge the controller of a file on responses as they were measured, without their spread.
 
-    Parameters
-    ----------
-    path : Path
-        As `read_controller` takes it: state space (.json, .mat) or filters (.toml).
-    responses, bounds : sequence of MeasuredResponse, Bounds
-    period : float or None
-        s; a continuous controller runs by Tustin's rule.
-
-    Returns
-    -------
-    PresentLoop
-
-    Raises
-    ------
-    UserError
-        The file holds no controller of these channels, or one of another rate.
+    The file is as `read_controller` takes it; with a period in s a continuous controller runs by
+    Tustin's rule. Raises UserError where it holds no controller of these channels, or one of
+    another rate.
     """
     K, _ = read_controller(path)
     outputs, inputs = responses[0].matrix.shape[1:]

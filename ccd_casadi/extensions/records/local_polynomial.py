@@ -89,22 +89,12 @@ def fit_locally(
     Z: np.ndarray, R: np.ndarray, lines: np.ndarray, period_lines: int = 1,
     options: WindowOptions = WindowOptions(),
 ) -> LocalFit:  # fmt: skip
-    """Fit local polynomials about lines of a transform.
+    """Fit local polynomials about some lines of a transform.
 
-    Parameters
-    ----------
-    Z, R : array (M, q, K), array (M, K)
-        Spectra of the signals and of the excitation in M records, line 0 first; G is one for all.
-    lines : int array (k,)
-        Where the responses are wanted.
-    period_lines : int
-        Number of whole periods in the record: only each such line is then excited, and the lines
-        between give T and the noise. 1: not periodic.
-    options : WindowOptions
-
-    Returns
-    -------
-    LocalFit
+    `Z` (M, q, K) and `R` (M, K) are spectra of the signals and of the excitation in M records, line
+    0 first; G is one for all. `period_lines` is the number of whole periods in the record: only
+    each such line is then excited, and the lines between give T and the noise; 1: it is not
+    periodic.
     """
     if period_lines > 1:
         return _periodic(Z, R, lines, period_lines, options)

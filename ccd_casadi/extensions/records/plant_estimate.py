@@ -143,23 +143,11 @@ def estimate_plant(
     options: EstimateOptions = EstimateOptions(),
     windows: WindowOptions = WindowOptions(),
 ) -> PlantEstimate:
-    """Estimate the plant's response from records.
+    """Estimate the plant's response from records of one plant.
 
-    Parameters
-    ----------
-    series : TimeSeries or sequence of them
-        Of one plant, in open loop with the force as the excitation; several are cut to the length
-        of the shortest. Where they differ, as with another amplitude, the spread is wider.
-    options, windows : EstimateOptions, WindowOptions
-
-    Returns
-    -------
-    PlantEstimate
-
-    Raises
-    ------
-    UserError
-        A record is too short, nothing excites the plant, or rates or periods differ.
+    In open loop the force is the excitation. Several are cut to the length of the shortest; where
+    they differ, as with another amplitude, the spread is wider. Raises UserError where a record is
+    too short, nothing excites the plant, or rates or periods differ.
     """
     records = [series] if isinstance(series, TimeSeries) else list(series)
     step = records[0].period
@@ -216,18 +204,9 @@ def estimate_plant(
 
 
 def quantile_of(degrees: Array, options: EstimateOptions) -> Array:
-    """Find the quantile of |e|²/σ² of an error e at the stated confidence.
+    """Find the quantile of |e|²/σ² of an error e at the stated confidence, of Fisher's F(2, 2ν).
 
-    Parameters
-    ----------
-    degrees : array (k,)
-        Of freedom behind σ², complex.
-    options : EstimateOptions
-
-    Returns
-    -------
-    array (k,)
-        Of Fisher's F(2, 2ν).
+    `degrees` (k,) are those of freedom behind σ², complex.
     """
     freedom = np.maximum(degrees, 1.0)
     return np.asarray(freedom * ((1.0 - options.confidence) ** (-1.0 / freedom) - 1.0))
@@ -244,17 +223,10 @@ def require_alive(series: TimeSeries) -> None:
 
 
 def kept_lines(count: int, periods: int, options: EstimateOptions) -> np.ndarray:
-    """Find the lines of a transform that are kept.
+    """Find the lines of a transform of `count` lines that are kept.
 
-    Parameters
-    ----------
-    count, periods, options : int, int, EstimateOptions
-        Lines of the transform; whole periods of the excitation in it, 1 if it is not periodic.
-
-    Returns
-    -------
-    int array (k,)
-        Those that are excited of a periodic record, thinned where they are closer than `apart`.
+    With `periods` whole periods of the excitation in it (1: not periodic) these are the excited
+    ones, thinned where they are closer than `apart`.
     """
     lines = np.arange(periods, count - 1, periods)
     lines = lines[lines > 1] if periods == 1 else lines
@@ -314,20 +286,9 @@ def estimate_channels(
 ) -> MatrixEstimate:
     """Estimate the response of all forces to all positions.
 
-    Parameters
-    ----------
-    records : sequence of lists of TimeSeries
-        As `read_channels` gives them, at least one a force, of unlike excitations.
-    options : EstimateOptions
-
-    Returns
-    -------
-    MatrixEstimate
-
-    Raises
-    ------
-    UserError
-        There are fewer records than forces, two excite alike, or rates and lengths differ.
+    Records are as `read_channels` gives them, at least one a force, of unlike excitations. Raises
+    UserError where there are fewer records than forces, two excite alike, or rates and lengths
+    differ.
     """
     m, p = len(records[0]), len(records[0][0])
     if len(records) < m:
@@ -373,16 +334,7 @@ def estimate_channels(
 
 
 def channel_findings(found: MatrixEstimate, options: EstimateOptions) -> list[tuple[str, str]]:
-    """List what is to be known of an estimate of several channels.
-
-    Parameters
-    ----------
-    found, options : MatrixEstimate, EstimateOptions
-
-    Returns
-    -------
-    list of (subject, words)
-    """
+    """List what is to be known of an estimate of several channels: subject and words."""
     _, p, m = found.G.shape
     ratio = np.median(found.spread / np.abs(found.G), axis=0)
     worst = np.unravel_index(int(ratio.argmax()), ratio.shape)

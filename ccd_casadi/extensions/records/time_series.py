@@ -78,22 +78,10 @@ class TimeSeries:
 
 
 def read_record(path: Path, names: SignalNames = SignalNames()) -> TimeSeries:
-    """Read a record.
+    """Read a record from CSV, .npz, .mat or WAV.
 
-    Parameters
-    ----------
-    path : Path
-        CSV, .npz, .mat or WAV.
-    names : SignalNames
-
-    Returns
-    -------
-    TimeSeries
-
-    Raises
-    ------
-    UserError
-        A column is missing or may be one of two, a unit is not known, or samples are missing.
+    Raises UserError where a column is missing or may be one of two, a unit is not known, or samples
+    are missing.
     """
     columns, rate, notes = read_columns(path)
     if names.injected and names.reference:

@@ -54,20 +54,8 @@ class ToleranceCase:
 
 
 def tolerance_case(case: Case) -> ToleranceCase:
-    """Check what a case says of its tolerances.
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    ToleranceCase
-
-    Raises
-    ------
-    UserError
-        A key has no effect, or what it names cannot be kept for a share.
+    """Check what a case says of its tolerances. Raises UserError where a key has no effect, or what
+    it names cannot be kept for a share.
     """
     table = case.robust
 
@@ -144,20 +132,7 @@ def design_for_share(
 ) -> ShareDesign:
     """The whole box first, from there the share, then fresh draws.
 
-    Parameters
-    ----------
-    of : ToleranceCase
-        With a plan.
-    sampler : Sampler
-        Of its problem.
-    theta : tuple of float or None
-        The machine, SI; None: it is searched.
-    seed, minutes : int, float
-        Of every draw; of each of the two searches.
-
-    Returns
-    -------
-    ShareDesign
+    `theta` is the machine in SI; None: it is searched. Each of the two searches has its `minutes`.
     """
     assert of.plan is not None
 
@@ -186,16 +161,7 @@ def design_for_share(
 
 
 def share_answer(found: ShareDesign) -> Answer:
-    """The verdict, the design, and what it gains over that for the whole box.
-
-    Parameters
-    ----------
-    found : ShareDesign
-
-    Returns
-    -------
-    Answer
-    """
+    """The verdict, the design, and what it gains over that for the whole box."""
     search, design, whole = found.search, found.design, found.whole
     problem, theta, line = search.problem, search.best.theta, found.certificate.line
     good = found.certificate.passed and design.certified

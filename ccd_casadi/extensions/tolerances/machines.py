@@ -222,24 +222,7 @@ def certified_share(
     on_box: DesignOnBox, plan: Plan, distribution: Mapping[str, str], seed: int,
     workers: Pool | None = None, options: ShareCertificateOptions = ShareCertificateOptions(),
 ) -> ShareCertificate:  # fmt: skip
-    """Judge a design on fresh draws.
-
-    Parameters
-    ----------
-    on_box : DesignOnBox
-        The design at its θ.
-    plan, distribution : Plan, mapping
-        How many draws, and of what.
-    seed : int
-        Of the run.
-    workers : Pool, optional
-        The result is the same for any number.
-    options : ShareCertificateOptions
-
-    Returns
-    -------
-    ShareCertificate
-    """
+    """Judge a design at its θ on fresh draws; the result is the same for any number of workers."""
     rng = np.random.default_rng((seed, options.seed))
     fresh = draw_machines(on_box.uncertain, distribution, rng, plan.draws)
     size = options.batch

@@ -268,24 +268,10 @@ def buy(
     between: Mapping[str, Sequence[float]], tell: Callable[[Bought], object],
     options: WidthOptions = WidthOptions(),
 ) -> WidthSearch | None:  # fmt: skip
-    """Search half-widths, machine and controller together.
+    """Search half-widths, machine and controller together, from θ and κ of a finished run, SI.
 
-    Parameters
-    ----------
-    sampler : Sampler
-        Of a case's problem.
-    theta, kappa : sequence of float, array
-        Of a finished run, SI.
-    costs, between : mapping
-        What f rises by for a percent, by name; least and largest half-width.
-    tell : callable
-        Is given every design.
-    options : WidthOptions
-
-    Returns
-    -------
-    WidthSearch or None
-        None where the run's design is not found again.
+    `costs` are what f rises by for a percent, `between` the least and largest half-width, both by
+    name; `tell` is given every design. None where the run's design is not found again.
     """
     own = structured_of(sampler.problem).uncertainty
     case = {name: getattr(own, name) for name in costs}

@@ -279,22 +279,8 @@ def started(
 def search_share(
     search: ShareSearch, tell: Tell, *, moves: bool, options: ShareOptions = ShareOptions()
 ) -> ShareSearch:
-    """Search over θ and controller.
-
-    Parameters
-    ----------
-    search : ShareSearch
-        As it begins.
-    tell : callable
-        Is given lines of progress.
-    moves : bool
-        Whether θ may move.
-    options : ShareOptions
-
-    Returns
-    -------
-    ShareSearch
-        The best, settled where the plan's trial has accepted it.
+    """Search over θ, where it may move, and controller: the best, settled where the plan's trial
+    has accepted it. `tell` is given lines of progress.
     """
     trial = search.plan.trial
     short = Trial(1, -(-trial.allowed // trial.rounds))
