@@ -25,24 +25,12 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Numbers of a motion and its derivatives.
+    """Numbers of a motion and its derivatives."""
 
-    Attributes
-    ----------
-    complex_step : float
-        Along the imaginary axis: derivatives of analytic functions, exact to rounding.
-    spring : float
-        Of the moving force: a plant that holds its output by more has a spring.
-    instants : int
-        Of a continuous move, at which its feedforward is examined.
-    beside : float
-        Of the duration: how far beside a jump of the snap, too.
-    """
-
-    complex_step: float = 1e-30
-    spring: float = 1e-6
-    instants: int = 2000
-    beside: float = 1e-9
+    complex_step: float = 1e-30  # along the imaginary axis: derivatives exact to rounding
+    spring: float = 1e-6  # of the moving force: a plant that holds its output by more has a spring
+    instants: int = 2000  # of a continuous move, at which its feedforward is examined
+    beside: float = 1e-9  # of the duration: how far beside a jump of the snap, too
 
 
 @dataclass(frozen=True)

@@ -399,20 +399,11 @@ class Facts:
 
 @dataclass(frozen=True)
 class Steps:
-    """Figures of which a slider shows one at a time.
-
-    Attributes
-    ----------
-    steps : tuple of (text, Lines)
-    first : int
-        Index of the one that is shown at first.
-    label : str
-        Of the slider.
-    """
+    """Figures of which a slider shows one at a time."""
 
     steps: tuple[tuple[str, Lines], ...]
-    first: int
-    label: str
+    first: int  # index of the one that is shown at first
+    label: str  # of the slider
 
 
 @dataclass(frozen=True)

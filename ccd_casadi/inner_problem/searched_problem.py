@@ -26,31 +26,17 @@ class WarmStartOptions:
 
 @dataclass(frozen=True)
 class SearchState:
-    """What a search has found.
+    """What a search has found."""
 
-    Attributes
-    ----------
-    warm_starts, error_warm_starts : tuple of κ in SI
-        Of the largest bandwidth; of the least RMS error or move time.
-    scenarios : tuple of (option, point of the box)
-    seed : int
-        Of the multi-start search that finds them.
-    """
-
-    warm_starts: tuple[tuple[float, ...], ...] = ()
-    error_warm_starts: tuple[tuple[float, ...], ...] = ()
-    scenarios: tuple[Scenario, ...] = ()
-    seed: int = 0
+    warm_starts: tuple[tuple[float, ...], ...] = ()  # κ (SI) of the largest bandwidth
+    error_warm_starts: tuple[tuple[float, ...], ...] = ()  # of the least error or time
+    scenarios: tuple[Scenario, ...] = ()  # options and points of the box
+    seed: int = 0  # of the multi-start search that finds them
 
 
 @dataclass(frozen=True)
 class SearchedProblem(CoDesignProblem):
-    """A statement with the state of a search for it.
-
-    Attributes
-    ----------
-    state : SearchState
-    """
+    """A statement with the state of a search for it."""
 
     state: SearchState = field(default_factory=SearchState)
 

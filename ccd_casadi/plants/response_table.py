@@ -35,36 +35,16 @@ BESIDE = ("spread", "coherence", "averages")
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Numbers of the test whether the units of magnitude and phase are as stated.
+    """Numbers of the test whether the units of magnitude and phase are as stated."""
 
-    Attributes
-    ----------
-    few_degrees : float
-        A phase within ± this many degrees may as well be in radians.
-    many_radians : float
-        A phase beyond ± this many radians may as well be in degrees.
-    bode_points : int
-        Points over ln f at which Bode's gain-phase relation is evaluated.
-    bode_delays : int
-        Delays that are tried with it.
-    bode_misfit : float
-        Mean misfit of the relation in rad beyond which a reading is doubted.
-    bode_gain : float
-        Share of the misfit below which another reading is as likely.
-    end : float
-        Factor of the first and the last line within which the slope beyond them is read.
-    confidence : float
-        Of a spread that coherence and averages give.
-    """
-
-    few_degrees: float = 30.0
-    many_radians: float = 4.0 * np.pi
-    bode_points: int = 200
-    bode_delays: int = 60
-    bode_misfit: float = float(np.radians(20.0))
-    bode_gain: float = 0.85
-    end: float = 1.5
-    confidence: float = 0.95
+    few_degrees: float = 30.0  # a phase within ± as many degrees may be in radians
+    many_radians: float = 4.0 * np.pi  # a phase beyond ± as many radians may be in degrees
+    bode_points: int = 200  # over ln f, at which Bode's gain-phase relation is evaluated
+    bode_delays: int = 60  # that are tried with it
+    bode_misfit: float = float(np.radians(20.0))  # rad, in the mean: beyond it a reading is doubted
+    bode_gain: float = 0.85  # share of the misfit below which another reading is as likely
+    end: float = 1.5  # factor of the end lines within which the slope beyond them is read
+    confidence: float = 0.95  # of a spread that coherence and averages give
 
 
 @dataclass(frozen=True)

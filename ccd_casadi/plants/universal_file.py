@@ -15,19 +15,12 @@ SUFFIXES = (".uff", ".unv", ".uf", ".bunv")
 
 @dataclass(frozen=True)
 class DatasetCodes:
-    """Codes of dataset 58 (SDRL, University of Cincinnati).
+    """Codes of dataset 58 (SDRL, University of Cincinnati)."""
 
-    Attributes
-    ----------
-    response_function, frequency, force, SI : int
-        Function type of an FRF; specific data types of an abscissa in Hz and of a force; code of
-        dataset 164.
-    """
-
-    response_function: int = 4
-    frequency: int = 18
-    force: int = 13
-    SI: int = 1
+    response_function: int = 4  # function type of an FRF
+    frequency: int = 18  # specific data type of an abscissa in Hz
+    force: int = 13  # that of a force
+    SI: int = 1  # code of dataset 164
 
 
 # by the specific data type of the ordinate: what it is, and units of it over N by label

@@ -47,32 +47,16 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
 
 @dataclass(frozen=True)
 class BriefOptions:
-    """What the brief asks of the design.
+    """What the brief asks of the design."""
 
-    Attributes
-    ----------
-    limits, risks, requirements : int
-        Of each at most; requirements are those with the least left.
-    shift : float
-        Of all resonances, relative: "3 % lower".
-    gain : float
-        Of the whole plant, relative.
-    resonances : int
-        That are compared before and after.
-    height : float
-        Of |S|, inches.
-    print_seconds : float
-        For a browser to write the PDF.
-    """
-
-    limits: int = 3
-    risks: int = 3
-    requirements: int = 7
-    shift: float = 0.03
-    gain: float = 0.1
-    resonances: int = 3
-    height: float = 2.9
-    print_seconds: float = 60.0
+    limits: int = 3  # at most
+    risks: int = 3  # at most
+    requirements: int = 7  # at most, those with the least left
+    shift: float = 0.03  # of all resonances, relative: "3 % lower"
+    gain: float = 0.1  # of the whole plant, relative
+    resonances: int = 3  # that are compared before and after
+    height: float = 2.9  # of |S|, inches
+    print_seconds: float = 60.0  # for a browser to write the PDF
 
 
 @dataclass(frozen=True)

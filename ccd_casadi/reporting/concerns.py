@@ -57,24 +57,12 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 
 @dataclass(frozen=True)
 class ConcernOptions:
-    """Usual limits of a loop beside those of `USUAL`.
+    """Usual limits of a loop beside those of `USUAL`."""
 
-    Attributes
-    ----------
-    slack : float
-        Relative: a design lies on its bounds, and 2 is the usual S_max.
-    overshoot : float
-        Of a step without feedforward.
-    between_lines : float
-        What |S| may reach between the lines of a response, over the largest on them.
-    identified : float
-        Relative: how well resonances are known where nothing else is stated.
-    """
-
-    slack: float = 0.01
-    overshoot: float = 0.5
-    between_lines: float = 1.1
-    identified: float = 0.05
+    slack: float = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
+    overshoot: float = 0.5  # of a step without feedforward
+    between_lines: float = 1.1  # what |S| may reach between lines, over the largest on them
+    identified: float = 0.05  # relative: how well resonances are known where nothing else is stated
 
 
 def limited_move(result: Mapping[str, Any]) -> str:

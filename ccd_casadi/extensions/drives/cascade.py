@@ -249,57 +249,31 @@ def _second_order(b: Array, a: Array, T: float) -> StateSpace:
 
 @dataclass(frozen=True)
 class ArithmeticOptions:
-    """What the drive's file does not say.
+    """What the drive's file does not say."""
 
-    Attributes
-    ----------
-    grain : float
-        N, of an integer of a fixed-point filter's signal.
-    bits : int
-        Of its coefficients' fraction.
-    distance, seconds, rest : float
-        m and s of the move that is simulated, and s of what follows.
-    """
-
-    grain: float = 2.0**-20
-    bits: int = 30
-    distance: float = 0.01
-    seconds: float = 0.2
-    rest: float = 0.1
+    grain: float = 2.0**-20  # N, of an integer of a fixed-point filter's signal
+    bits: int = 30  # of its coefficients' fraction
+    distance: float = 0.01  # m, of the move that is simulated
+    seconds: float = 0.2  # that it takes
+    rest: float = 0.1  # s of what follows
 
 
 @dataclass(frozen=True)
 class Program:
-    """Numbers of one cascade's program, in the order in which they are used.
-
-    Attributes
-    ----------
-    kind : Number
-    real : type
-        The floating point.
-    Kv, Kp, share, rate : float
-        1/s; N s/m; T/Tn; 1/T.
-    setpoint, current : tuple of (b0, b1, b2, a1, a2)
-        Filters; integers where the drive has fixed point.
-    options : ArithmeticOptions
-    slower : int
-        Calls to one of the position loop.
-    ahead, push : float
-        f, and m/T in kg/s.
-    """
+    """Numbers of one cascade's program, in the order in which they are used."""
 
     kind: Number
-    real: type
-    Kv: float
-    Kp: float
-    share: float
-    rate: float
-    setpoint: tuple[tuple[Any, ...], ...]
-    current: tuple[tuple[Any, ...], ...]
+    real: type  # the floating point
+    Kv: float  # 1/s
+    Kp: float  # N s/m
+    share: float  # T/Tn
+    rate: float  # 1/T
+    setpoint: tuple[tuple[Any, ...], ...]  # filters (b0, b1, b2, a1, a2); fixed point: int
+    current: tuple[tuple[Any, ...], ...]  # the same
     options: ArithmeticOptions
-    slower: int = 1
-    ahead: float = 0.0
-    push: float = 0.0
+    slower: int = 1  # calls to one of the position loop
+    ahead: float = 0.0  # f
+    push: float = 0.0  # m/T, kg/s
 
     def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
         """Force at every instant, of the reference and both sensors in m as the drive has them."""

@@ -193,49 +193,25 @@ def _sensors(bounds: Bounds, velocity: str | None) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class DriveCodesignOptions:
-    """Numbers of the search over θ.
+    """Numbers of the search over θ."""
 
-    Attributes
-    ----------
-    evaluations : int
-        θ that are tried for each combination of listed values, at most.
-    first, last : float
-        Steps of θ at the start and at the end, as shares of the box.
-    penalty : float
-        J of a θ without a cascade, over |J| of the first one.
-    met : float
-        λ that counts as met.
-    drive : DriveOptions
-    """
-
-    evaluations: int = 20
-    first: float = 0.2
-    last: float = 0.02
-    penalty: float = 10.0
-    met: float = 1e-9
+    evaluations: int = 20  # θ that are tried for each combination of listed values, at most
+    first: float = 0.2  # step of θ at the start, as a share of the box
+    last: float = 0.02  # and at the end
+    penalty: float = 10.0  # J of a θ without a cascade, over |J| of the first one
+    met: float = 1e-9  # λ that counts as met
     drive: DriveOptions = field(default_factory=DriveOptions)
 
 
 @dataclass(frozen=True)
 class DriveAt:
-    """The fastest cascade at one θ, before rounding.
+    """The fastest cascade at one θ, before rounding."""
 
-    Attributes
-    ----------
-    theta : tuple of float
-        In the case's units.
-    cost, objective : float
-        f(θ) and J.
-    candidate : Candidate
-    mass : float
-        kg that the force moves.
-    """
-
-    theta: tuple[float, ...]
-    cost: float
-    objective: float
+    theta: tuple[float, ...]  # in the case's units
+    cost: float  # f(θ)
+    objective: float  # J
     candidate: Candidate
-    mass: float
+    mass: float  # kg that the force moves
 
 
 def codesign_drive(

@@ -40,29 +40,14 @@ NO_CASCADE = (
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """Numbers of a drive's design.
+    """Numbers of a drive's design."""
 
-    Attributes
-    ----------
-    draws : int
-        Plants that are drawn for the judge in each round, besides the corners.
-    added : int
-        Of these the worst that a round adds to the search's plants, at most.
-    rounds : int
-        Of search and proof: a plant that the proof finds is added.
-    rise_points : int
-        Frequencies up to half the rate at which the filters' gain is checked.
-    lowered, lower : int, float
-        How often, and by which share, ω_b is lowered where the proof finds a slower plant.
-    search, rounding : SearchOptions, RoundingOptions
-    """
-
-    draws: int = 200
-    rounds: int = 3
-    added: int = 4
-    lowered: int = 10
-    lower: float = 1e-3
-    rise_points: int = 20_000
+    draws: int = 200  # plants that are drawn for the judge in each round, besides the corners
+    rounds: int = 3  # of search and proof: a plant that the proof finds is added
+    added: int = 4  # of the drawn ones, the worst that join the search's plants in a round at most
+    lowered: int = 10  # how often ω_b is lowered where the proof finds a slower plant
+    lower: float = 1e-3  # by which share
+    rise_points: int = 20_000  # frequencies to half the rate at which the filters' gain is checked
     search: SearchOptions = field(default_factory=SearchOptions)
     rounding: RoundingOptions = field(default_factory=RoundingOptions)
 

@@ -43,33 +43,15 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """Numbers of the interpolation.
+    """Numbers of the interpolation."""
 
-    Attributes
-    ----------
-    degree : int
-        m of each parameter.
-    ellipse : float
-        ρ.
-    lebesgue : float
-        Not below the Lebesgue constant of m + 1 Chebyshev points (2/π ln(m + 1) + 1).
-    dropped : float
-        Relative: terms below it count as part of the error.
-    rounding : float
-        Relative to the largest value, what a coefficient loses in double precision.
-    most_parameters : int
-        More are not interpolated.
-    alike : float
-        Relative: by how much responses may differ from the plant's own.
-    """
-
-    degree: int = 10
-    ellipse: float = 16.0
-    lebesgue: float = 2.6
-    dropped: float = 1e-12
-    rounding: float = 1e-12
-    most_parameters: int = 3
-    alike: float = 1e-8
+    degree: int = 10  # m of each parameter
+    ellipse: float = 16.0  # ρ
+    lebesgue: float = 2.6  # not below the constant of m + 1 Chebyshev points (2/π ln(m + 1) + 1)
+    dropped: float = 1e-12  # relative: terms below it count as part of the error
+    rounding: float = 1e-12  # over the largest value: what a coefficient loses in double precision
+    most_parameters: int = 3  # more are not interpolated
+    alike: float = 1e-8  # relative: by how much responses may differ from the plant's own
 
 
 @dataclass(frozen=True)

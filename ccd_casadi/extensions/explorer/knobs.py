@@ -117,22 +117,12 @@ class Problems:
 
 @dataclass(frozen=True)
 class NotchOptions:
-    """Ranges of the notch's sliders.
+    """Ranges of the notch's sliders."""
 
-    Attributes
-    ----------
-    deepest, none : float
-        Least gain at its frequency, and the gain from which on it is no notch.
-    damping : tuple of float
-        Least, first and largest damping ratio of its poles: half its width over its frequency.
-    beside : float
-        How far its flanks are looked at, in widths.
-    """
-
-    deepest: float = 0.01
-    none: float = 0.99
-    damping: tuple[float, float, float] = (0.02, 0.3, 2.0)
-    beside: float = 3.0
+    deepest: float = 0.01  # least gain at its frequency
+    none: float = 0.99  # gain from which on it is no notch
+    damping: tuple[float, float, float] = (0.02, 0.3, 2.0)  # least, first, largest: half its width
+    beside: float = 3.0  # how far its flanks are looked at, in widths
 
 
 @dataclass(frozen=True)

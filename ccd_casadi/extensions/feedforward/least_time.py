@@ -30,30 +30,14 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class LeastTimeOptions:
-    """Numbers of the search for the least time.
+    """Numbers of the search for the least time."""
 
-    Attributes
-    ----------
-    margin : float
-        Share of the window that is kept free on the plants of the design.
-    largest : float
-        What a coefficient moves, over the move.
-    first : int
-        Rows of a plant that the first programme has, spread over all times.
-    added : int
-        Rows that enter at most after each programme.
-    rounds : int
-        Programmes at most for one time.
-    tight : float
-        Of the window, the force and the heat: a row that is violated by less is kept.
-    """
-
-    margin: float = 0.1
-    largest: float = 20.0
-    first: int = 20
-    added: int = 300
-    rounds: int = 40
-    tight: float = 1e-3
+    margin: float = 0.1  # share of the window that is kept free on the plants of the design
+    largest: float = 20.0  # what a coefficient moves, over the move
+    first: int = 20  # rows of a plant that the first programme has, spread over all times
+    added: int = 300  # rows that enter at most after each programme
+    rounds: int = 40  # programmes at most for one time
+    tight: float = 1e-3  # of window, force and heat: a row that is violated by less is kept
 
 
 @dataclass(frozen=True)

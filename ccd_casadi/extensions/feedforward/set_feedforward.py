@@ -72,43 +72,21 @@ class FeedforwardSetOptions:
 
 @dataclass(frozen=True)
 class SetFeedforward:
-    """A feedforward and what it does.
-
-    Attributes
-    ----------
-    found : LeastTime
-    inverse : (c,) array
-        The model's inverse as coefficients of one tap.
-    profile : Setpoint
-    window : float
-        Unit of y.
-    responses : tuple of MoveResponses
-        Of the plants of the design, the model's first; of one tap.
-    settled, settled_inverse : (plants,) array
-        When each has settled, s: with what was found and with the inverse.
-    judged, judged_inverse : (draws,) array
-        Of the plants that judge; empty where the run has no box to draw from.
-    limits : ForceLimits
-        What the inverse needs.
-    heat, peak : float
-        The largest of all plants, those that judge too, N² s and N.
-    contraction : float
-        ρ of `move_responses`, of the design's plants.
-    """
+    """A feedforward and what it does."""
 
     found: LeastTime
-    inverse: Array
+    inverse: Array  # (c,) the model's inverse as coefficients of one tap
     profile: Setpoint
-    window: float
-    responses: tuple[MoveResponses, ...]
-    settled: Array
-    settled_inverse: Array
-    judged: Array
-    judged_inverse: Array
-    limits: ForceLimits
-    heat: float
-    peak: float
-    contraction: float
+    window: float  # unit of y
+    responses: tuple[MoveResponses, ...]  # of one tap, of the design's plants, the model's first
+    settled: Array  # (plants,) when each has settled, s
+    settled_inverse: Array  # the same with the inverse
+    judged: Array  # (draws,) of the plants that judge; empty where the run has no box to draw from
+    judged_inverse: Array  # the same with the inverse
+    limits: ForceLimits  # what the inverse needs
+    heat: float  # N² s, the largest of all plants, those that judge too
+    peak: float  # N, the same
+    contraction: float  # ρ of `move_responses`, of the design's plants
 
     @property
     def latest(self) -> float:

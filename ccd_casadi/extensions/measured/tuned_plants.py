@@ -220,20 +220,12 @@ def with_lines_near(
 
 @dataclass(frozen=True)
 class PresentLoop:
-    """The loop of the present controller, the worst of several responses.
+    """The loop of the present controller, the worst of several responses."""
 
-    Attributes
-    ----------
-    stable : bool
-        By the winding on the lines.
-    bandwidth_hz, peak, peak_hz : float
-        First -3 dB of S, the largest |S| on the lines and where; NaN where it is not stable.
-    """
-
-    stable: bool
-    bandwidth_hz: float
-    peak: float
-    peak_hz: float
+    stable: bool  # by the winding on the lines
+    bandwidth_hz: float  # first -3 dB of S; NaN where it is not stable, as the next two
+    peak: float  # the largest |S| on the lines
+    peak_hz: float  # where
 
     @property
     def words(self) -> str:

@@ -60,29 +60,14 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class LocalFit:
-    """Responses of q signals to the excitation at some lines.
+    """Responses of q signals to the excitation at some lines."""
 
-    Attributes
-    ----------
-    G : array (k, q)
-    covariance : array (k, q, q)
-        E[e eᴴ] of the error e of G.
-    degrees : array (k,)
-        Degrees of freedom behind the covariance, complex.
-    coherence : array (k, q)
-        Share of a signal's power in the window that the excitation explains, beside T.
-    transient : array (k, q)
-        Share of a signal's power that T alone explains.
-    width : array (k,)
-        Lines of the window.
-    """
-
-    G: np.ndarray
-    covariance: np.ndarray
-    degrees: Array
-    coherence: Array
-    transient: Array
-    width: Array
+    G: np.ndarray  # (k, q)
+    covariance: np.ndarray  # (k, q, q) E[e eᴴ] of the error e of G
+    degrees: Array  # (k,) of freedom behind the covariance, complex
+    coherence: Array  # (k, q) share of a signal's power that the excitation explains, beside T
+    transient: Array  # (k, q) share of a signal's power that T alone explains
+    width: Array  # (k,) lines of the window
 
 
 def fit_locally(

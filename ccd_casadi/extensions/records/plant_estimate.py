@@ -257,20 +257,12 @@ def _period(excitation: Array, options: EstimateOptions) -> int:
 
 @dataclass(frozen=True)
 class MatrixEstimate:
-    """A plant's response by records of several channels.
+    """A plant's response by records of several channels."""
 
-    Attributes
-    ----------
-    hz, G, spread : array (k,), (k, p, m), (k, p, m)
-        Lines in Hz; unit of y over N, and the radius of each entry.
-    coherence : array (k,)
-        The least of all signals and records.
-    """
-
-    hz: Array
-    G: np.ndarray
-    spread: Array
-    coherence: Array
+    hz: Array  # (k,) lines
+    G: np.ndarray  # (k, p, m) unit of y over N
+    spread: Array  # (k, p, m) radius of each entry
+    coherence: Array  # (k,) the least of all signals and records
 
 
 def read_channels(

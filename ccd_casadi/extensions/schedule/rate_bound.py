@@ -44,25 +44,13 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class RateBoundOptions:
-    """Numbers of the bound.
+    """Numbers of the bound."""
 
-    Attributes
-    ----------
-    positions : int
-        N of each part.
-    halvings : int
-        Of the interval of rates.
-    share : float
-        s.
-    decades, weights : float, int
-        To each side of 1 and count of w_f/w_s.
-    """
-
-    positions: int = 101
-    halvings: int = 18
-    share: float = 0.8
-    decades: float = 4.0
-    weights: int = 65
+    positions: int = 101  # N of each part
+    halvings: int = 18  # of the interval of rates
+    share: float = 0.8  # s
+    decades: float = 4.0  # to each side of 1, of w_f/w_s
+    weights: int = 65  # their number
 
 
 @dataclass(frozen=True)

@@ -58,32 +58,17 @@ class FrozenPosition:
 
 @dataclass(frozen=True)
 class Schedule:
-    """A schedule and what is known of it.
+    """A schedule and what is known of it."""
 
-    Attributes
-    ----------
-    name, unit : str
-        Of the parameter that is measured.
-    segments : tuple of Segment
-    alone : tuple of Alone
-    whole : float
-        ω_b of one controller for all of the range, rad/s.
-    frozen : tuple of FrozenPosition
-    rates : tuple of RateTrial
-    bound : RateBound
-    crossed : RateTrial
-        The simulation at this bound.
-    """
-
-    name: str
-    unit: str
+    name: str  # of the parameter that is measured
+    unit: str  # of it
     segments: tuple[Segment, ...]
     alone: tuple[Alone, ...]
-    whole: float
+    whole: float  # ω_b of one controller for all of the range, rad/s
     frozen: tuple[FrozenPosition, ...]
     rates: tuple[RateTrial, ...]
     bound: RateBound
-    crossed: RateTrial
+    crossed: RateTrial  # the simulation at this bound
 
     @property
     def verified(self) -> bool:

@@ -36,48 +36,23 @@ from ccd_casadi.support.text import counted
 
 @dataclass(frozen=True)
 class ScheduleOptions:
-    """Numbers of a schedule.
+    """Numbers of a schedule."""
 
-    Attributes
-    ----------
-    share : float
-        Of the bandwidth that a position has alone, which its part has at least.
-    most : int
-        Parts at most.
-    overlap : float
-        d, over the width of the part that is halved.
-    positions : int
-        At which a controller for that position alone is searched, evenly over the range.
-    refinements : int
-        Times at most that positions at which a part exceeds a bound join its design.
-    boxes : int
-        Enclosures of the proof of a part at most: some two minutes.
-    """
-
-    share: float = 0.9
-    most: int = 8
-    overlap: float = 0.05
-    positions: int = 5
-    refinements: int = 3
-    boxes: int = 4_000_000
+    share: float = 0.9  # of the bandwidth that a position has alone, which its part has at least
+    most: int = 8  # parts at most
+    overlap: float = 0.05  # d, over the width of the part that is halved
+    positions: int = 5  # at which a controller for it alone is searched, evenly over the range
+    refinements: int = 3  # times that positions at which a part exceeds a bound join its design
+    boxes: int = 4_000_000  # enclosures of the proof of a part at most: some two minutes
 
 
 @dataclass(frozen=True)
 class DesignedPart:
-    """A part of the range with the controller that was found for it.
+    """A part of the range with the controller that was found for it."""
 
-    Attributes
-    ----------
-    low, high : float
-        Of p, SI.
-    problem : CoDesignProblem
-        With p in [low, high], and with what the search found.
-    design : SectionsDesign
-    """
-
-    low: float
-    high: float
-    problem: CoDesignProblem
+    low: float  # of p, SI
+    high: float  # of p, SI
+    problem: CoDesignProblem  # with p in [low, high], and with what the search found
     design: SectionsDesign
 
 

@@ -35,28 +35,14 @@ Machine = tuple[int, Array]  # option, point of the box
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """Numbers of the draws.
+    """Numbers of the draws."""
 
-    Attributes
-    ----------
-    sigmas : float
-        Standard deviations from the model to an end of the range.
-    enough : float
-        Fresh draws, over the least number that shows the share where none fails.
-    reliable : float
-        Probability that a search does not end with a design that its certificate refuses.
-    confirming, most : int
-        Rounds of the certificate's number of draws that accept a design, at least and at most.
-    attempts : int
-        Designs of a search that such rounds may judge.
-    """
-
-    sigmas: float = 3.0
-    enough: float = 3.0
-    reliable: float = 0.999
-    confirming: int = 6
-    most: int = 64
-    attempts: int = 8
+    sigmas: float = 3.0  # standard deviations from the model to an end of the range
+    enough: float = 3.0  # fresh draws, over the least number that shows the share where none fails
+    reliable: float = 0.999  # probability that the certificate accepts what a search ends with
+    confirming: int = 6  # rounds of the certificate's draws that accept a design, at least
+    most: int = 64  # the same at most
+    attempts: int = 8  # designs of a search that such rounds may judge
 
 
 def tolerance_of(name: str) -> str:
@@ -104,13 +90,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Plan:
-    """How many draws decide on a share at a confidence, and what accepts a design before.
-
-    Attributes
-    ----------
-    share, confidence : float
-    options : MachineOptions
-    """
+    """How many draws decide on a share at a confidence, and what accepts a design before."""
 
     share: float
     confidence: float

@@ -82,35 +82,17 @@ class ShareOptions:
 
 @dataclass(frozen=True)
 class ShareSearch:
-    """A search as far as it is.
+    """A search as far as it is."""
 
-    Attributes
-    ----------
-    sampler : Sampler
-        Of the problem whose scenarios are the working set.
-    best : InnerSample
-        θ and κ on that set.
-    plan, distribution, seed : Plan, mapping, int
-        What is required, how tolerances are drawn, and the run's seed.
-    tail : tuple of Machine
-        Draws that are ranked again.
-    rounds : int
-        Of new draws, each of the certificate's number.
-    settled : bool
-        Whether new draws have accepted it.
-    whole_box : tuple of float
-        κ in SI of the design for the whole box, from which a search may start again.
-    """
-
-    sampler: Sampler
-    best: InnerSample
-    plan: Plan
-    distribution: Mapping[str, str]
-    seed: int
-    tail: tuple[Machine, ...] = ()
-    rounds: int = 0
-    settled: bool = False
-    whole_box: tuple[float, ...] = ()
+    sampler: Sampler  # of the problem whose scenarios are the working set
+    best: InnerSample  # θ and κ on that set
+    plan: Plan  # what is required
+    distribution: Mapping[str, str]  # how tolerances are drawn
+    seed: int  # the run's
+    tail: tuple[Machine, ...] = ()  # draws that are ranked again
+    rounds: int = 0  # of new draws, each of the certificate's number
+    settled: bool = False  # whether new draws have accepted it
+    whole_box: tuple[float, ...] = ()  # κ (SI) of the design for the whole box, to start from again
 
     @property
     def problem(self) -> CoDesignProblem:
