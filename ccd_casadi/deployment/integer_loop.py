@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
-from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware
+from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware, forward_gains
 from ccd_casadi.lti.ports import BreakPoint, course
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.arrays import Array
@@ -64,13 +64,6 @@ def ranges_of_moves(
                 peaks = np.maximum(peaks, np.abs(np.concatenate([z, e, u])))
                 x, z = held.A @ x + held.B @ u, K.A @ z + K.B @ e
     return Ranges(peaks[:n], peaks[n : n + p], peaks[n + p :])
-
-
-def forward_gains(
-    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
-) -> Array:
-    """Feedforward (5, m) of a setpoint's derivatives; `reference` (p,) as of `course`."""
-    return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 
 def rounding_bound(

@@ -101,8 +101,7 @@ def move(
     wanted, (output, reference) = profile.at(time), course(plant, axis, places)
     ahead = np.zeros((count, m))
     if forward is not None:
-        own = forward @ reference if places else forward[:, :, axis]
-        ahead = wanted.T @ own
+        ahead = wanted.T @ forward_gains(forward, reference, axis, places)
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
@@ -185,6 +184,13 @@ def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, b
         return u, bool(np.any(u != v))
 
     return in_floats
+
+
+def forward_gains(
+    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
+) -> Array:
+    """Feedforward (5, m) of a setpoint's derivatives; `reference` (p,) as of `course`."""
+    return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 
 def forward_of(
