@@ -26,7 +26,7 @@ class FixedOptions:
     """Numbers of the formats."""
 
     headroom: float = 4.0  # of a range over a move's largest value; what is beyond it saturates
-    guards: tuple[tuple[int, int], ...] = ((16, 16), (32, 28))  # word, behind a state's
+    guards: tuple[tuple[int, int], ...] = ((16, 16), (32, 28))  # bits of a word, and behind
     accumulator: int = 62  # bits of a sum beside its sign, one left free
 
 

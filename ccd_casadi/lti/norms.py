@@ -25,7 +25,7 @@ class NormOptions:
     climbed: float = 0.1  # relative: how far below the largest a maximum is climbed, too
     climbs: int = 4  # maxima that are climbed
     divisions: int = 4  # times that the bracket of each is divided
-    points: int = 41  # into so many
+    points: int = 41  # of the bracket at each division
 
 
 def gains(system: StateSpace, omega: Array, *, memory: int = 1_000_000) -> Array:

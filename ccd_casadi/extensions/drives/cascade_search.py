@@ -151,8 +151,8 @@ class RoundingOptions:
 
     steps: int = 6  # of the other values, for each neighbour
     passes: int = 8  # over all values, at most
-    hops: tuple[int, ...] = (-3, -1, 1, 3)  # numbers of steps
-    fine: float = 1e-5  # a step so small relative to its value is rounded without a search
+    hops: tuple[int, ...] = (-3, -1, 1, 3)  # steps at once
+    fine: float = 1e-5  # of a value: a step as small is rounded without a search
 
 
 def on_the_grid(

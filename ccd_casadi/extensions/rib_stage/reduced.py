@@ -63,7 +63,7 @@ RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 class ReducedBasisOptions:
     """Numbers of the reduced basis."""
 
-    known_slope: float = 1e-4  # of its length, that a mode's derivative may lie beside the basis
+    known_slope: float = 1e-4  # share of a mode's derivative that may lie beside the basis
     known_mode: float = 1e-8  # the same of a mode: rounding
     beyond: int = 4  # modes of a symmetry beyond those kept, by which shapes change
     levels: int = 2  # static responses to forces, as levels of a Krylov space
