@@ -54,44 +54,19 @@ class DriveOptions:
 
 @dataclass(frozen=True)
 class DriveDesign:
-    """A cascade with its rounded values, and what is known of it.
-
-    Attributes
-    ----------
-    cascade : Cascade
-    values : array (n,)
-        On the drive's grid, SI.
-    bandwidth : float
-        ω_b in rad/s, for which the proof is.
-    free : Candidate
-        Before rounding.
-    certificate : SetCertificate
-        Of the rounded controller, on corners, draws and what the proof found.
-    proof : Proof
-        Of the rounded controller.
-    worst : Excess
-        The worst of the judged plants.
-    drawn : Yield or None
-        Those that were drawn since the last change of the design; None where it is proven.
-    compliance : float or None
-        The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
-    mass : float
-        kg that the force moves as a rigid body, at the position's sensor; 0: none.
-    between : BetweenSamples or None
-        S between the samples, where the position counts; None of two rates.
-    """
+    """A cascade with its rounded values, and what is known of it."""
 
     cascade: Cascade
-    values: Array
-    bandwidth: float
-    free: Candidate
-    certificate: SetCertificate
-    proof: Proof
-    worst: Excess
-    drawn: Yield | None = None
-    compliance: float | None = None
-    mass: float = 0.0
-    between: BetweenSamples | None = None
+    values: Array  # (n,) on the drive's grid, SI
+    bandwidth: float  # ω_b in rad/s, for which the proof is
+    free: Candidate  # before rounding
+    certificate: SetCertificate  # of the rounded controller, on corners, draws and the proof's
+    proof: Proof  # of the rounded controller
+    worst: Excess  # of the judged plants
+    drawn: Yield | None = None  # since the last change of the design; None where it is proven
+    compliance: float | None = None  # the largest |z/d| that the judge found, m/N; it is not proven
+    mass: float = 0.0  # kg that the force moves as a rigid body, at the position's sensor; 0: none
+    between: BetweenSamples | None = None  # S between the samples, where the position counts
 
     @property
     def feedforward(self) -> list[tuple[Setting, float]]:

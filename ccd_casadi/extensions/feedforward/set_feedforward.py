@@ -41,33 +41,16 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class FeedforwardSetOptions:
-    """Numbers of the design for a set.
+    """Numbers of the design for a set."""
 
-    Attributes
-    ----------
-    drawn, added, rounds : int
-        Plants that are drawn after a design, those of them that join it at most, and how often.
-    judges : int
-        Plants that judge the last design.
-    tail : float
-        What is simulated after the setpoint, over its duration, doubled until the model's inverse
-        has settled on every plant.
-    doublings : int
-        At most.
-    spreads : tuple of float
-        Delays of the last tap that are tried, in periods of the lowest flexible mode.
-    worth : float
-        More taps have to settle earlier by this share.
-    """
-
-    drawn: int = 200
-    added: int = 5
-    rounds: int = 4
-    judges: int = 500
-    tail: float = 3.0
-    doublings: int = 4
-    spreads: tuple[float, ...] = (0.5, 1.0)
-    worth: float = 0.05
+    drawn: int = 200  # plants that are drawn after a design
+    added: int = 5  # those of them that join it at most
+    rounds: int = 4  # how often
+    judges: int = 500  # plants that judge the last design
+    tail: float = 3.0  # what is simulated after the setpoint, over its duration
+    doublings: int = 4  # of the tail at most, until the model's inverse has settled on every plant
+    spreads: tuple[float, ...] = (0.5, 1.0)  # delays of the last tap, in periods of the lowest mode
+    worth: float = 0.05  # more taps have to settle earlier by this share
 
 
 @dataclass(frozen=True)

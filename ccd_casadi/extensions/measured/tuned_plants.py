@@ -28,42 +28,19 @@ Plant = MeasuredResponse | StateSpace
 
 @dataclass(frozen=True)
 class LineOptions:
-    """Numbers of the lines on which a model is tuned.
+    """Numbers of the lines on which a model is tuned."""
 
-    Attributes
-    ----------
-    per_decade : int
-        Lines a decade, besides those around roots.
-    lowest, highest : float
-        First line over the slowest root, last line over half the rate.
-    on_axis : float
-        |Re p|/|p| up to which a pole has no damping.
-    half_width : float
-        Relative half width that such a pole is given for its lines.
-    hidden : float
-        Relative singular value below which a mode is not driven, or not measured.
-    apart : float
-        Least relative distance of two lines.
-    at_rest : float
-        Share of the largest root below which a root lies at 0.
-    most_samples : int
-        Samples of a delay at most.
-    nearby, halvings : float, int
-        Relative distance of the outermost line that is added beside a frequency, and how many lines
-        are added on each side, each at half the distance of the one before.
-    """
-
-    per_decade: int = 60
-    lowest: float = 3e-3
-    highest: float = 0.98
-    on_axis: float = 1e-8
-    half_width: float = 1e-3
-    hidden: float = 1e-12
-    apart: float = 1e-6
-    at_rest: float = 1e-7
-    most_samples: int = 1000
-    nearby: float = 0.02
-    halvings: int = 6
+    per_decade: int = 60  # lines, besides those around roots
+    lowest: float = 3e-3  # first line over the slowest root
+    highest: float = 0.98  # last line over half the rate
+    on_axis: float = 1e-8  # |Re p|/|p| up to which a pole has no damping
+    half_width: float = 1e-3  # relative, that such a pole is given for its lines
+    hidden: float = 1e-12  # relative singular value of a mode that is not driven, or not measured
+    apart: float = 1e-6  # least relative distance of two lines
+    at_rest: float = 1e-7  # share of the largest root below which a root lies at 0
+    most_samples: int = 1000  # of a delay
+    nearby: float = 0.02  # relative distance of the outermost line that is added beside a frequency
+    halvings: int = 6  # lines added on each side, each at half the distance of the one before
 
 
 def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
