@@ -66,7 +66,17 @@ def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
 
 
 def cost_label(problem: CoDesignProblem, name: str = "hardware cost f") -> str:
-    """The hardware cost on an axis, or in the head of a table."""
+    """Name the hardware cost with its unit, on an axis or in the head of a table.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    name : str
+
+    Returns
+    -------
+    str
+    """
     return f"{name} ({problem.cost_unit})" if problem.cost_unit else name
 
 
