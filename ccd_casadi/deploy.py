@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -209,19 +209,6 @@ def _summary(
     ).rstrip()  # fmt: skip
 
 
-@dataclass(frozen=True)
-class TimingWordsOptions:
-    """Numbers of the comparison with the design.
-
-    Attributes
-    ----------
-    same : float
-        Relative difference of two rates or delays up to which they are the same.
-    """
-
-    same: float = 1e-9
-
-
 def needed_words(found: "Deployment") -> str:
     """What the loop was designed for, or the least rate that it needs."""
     if found.designed_for is not None:
@@ -252,11 +239,10 @@ def _own(designed: "Sampling") -> str:
     return f"{designed.rate_hz:.6g} Hz and {designed.delay_us:.4g} us"
 
 
-def _of_design(
-    found: "Deployment", designed: "Sampling", options: TimingWordsOptions = TimingWordsOptions()
-) -> str:
-    """How the loop runs otherwise than it was designed to, and the remedy of that."""
-    more, causes, keys = 1.0 + options.same, [], []
+def _of_design(found: "Deployment", designed: "Sampling", *, same: float = 1e-9) -> str:
+    """How the loop runs otherwise than it was designed to, and the remedy of that; rates and delays
+    that differ by a share of `same` are the same."""
+    more, causes, keys = 1.0 + same, [], []
     if found.rate_hz * more < designed.rate_hz:
         causes.append(f"the rate is below the {designed.rate_hz:.6g} Hz")
         keys.append(f"loop.rate_hz = {found.rate_hz:.6g}")
@@ -266,8 +252,7 @@ def _of_design(
     if causes:
         why, write = " and ".join(causes), " and ".join(keys)
         return f"{why} of the design: keep to the design, or write {write} in the case and solve it"
-    same = found.rate_hz <= more * designed.rate_hz and more * found.delay >= designed.delay
-    if same:
+    if found.rate_hz <= more * designed.rate_hz and more * found.delay >= designed.delay:
         return "the loop runs as it was designed: solve the case again"
     return f"it was designed for {_own(designed)}: keep to these"
 

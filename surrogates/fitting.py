@@ -50,21 +50,11 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Numbers of the calibration of deviations.
+    """Numbers of the calibration of deviations."""
 
-    Attributes
-    ----------
-    least_samples : int
-        Fewer left out do not show how a function continues.
-    refitted : int
-        Observations up to which samples are left out of fits.
-    folds : int
-        In this number of parts.
-    """
-
-    least_samples: int = 5
-    refitted: int = 100
-    folds: int = 8
+    least_samples: int = 5  # left out: fewer do not show how a function continues
+    refitted: int = 100  # observations up to which samples are left out of fits
+    folds: int = 8  # parts in which they are left out
 
 
 def fit(

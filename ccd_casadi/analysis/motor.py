@@ -28,30 +28,14 @@ MOTOR_LIMITS = {"peak force": "peak_share", "motor power": "heat_share"}
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Numbers of a motion and its derivatives.
+    """Numbers of a motion and its derivatives."""
 
-    Attributes
-    ----------
-    complex_step : float
-        Along the imaginary axis: derivatives of analytic functions, exact to rounding.
-    spring : float
-        Of the moving force: a plant that holds its output by more has a spring.
-    nodes : int
-        Of Gauss and Legendre in each interval of a setpoint: exact for squares of forces.
-    shares : int
-        Instants in each interval, of which the nearest to a peak force begins Newton's step.
-    instants : int
-        Of a continuous move, at which its feedforward is examined.
-    beside : float
-        Of the duration: how far beside a jump of the snap, too.
-    """
-
-    complex_step: float = 1e-30
-    spring: float = 1e-6
-    nodes: int = 5
-    shares: int = 17
-    instants: int = 2000
-    beside: float = 1e-9
+    complex_step: float = 1e-30  # along the imaginary axis: derivatives exact to rounding
+    spring: float = 1e-6  # of the moving force: a plant that holds its output by more has a spring
+    nodes: int = 5  # of Gauss and Legendre in each interval of a setpoint: exact for squares
+    shares: int = 17  # instants in each interval, where Newton's step to a peak force begins
+    instants: int = 2000  # of a continuous move, at which its feedforward is examined
+    beside: float = 1e-9  # of the duration: how far beside a jump of the snap, too
 
 
 @dataclass(frozen=True)

@@ -131,22 +131,12 @@ def _points(low: Array, high: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PanelOptions:
-    """Numbers of the panels of the quadrature over frequency.
+    """Numbers of the panels of the quadrature over frequency."""
 
-    Attributes
-    ----------
-    lowest, highest : float
-        Ends of a white spectrum, over the slowest and the fastest pole.
-    per_decade : int
-        Panels a decade at least, as a curve is drawn through their ends.
-    flanks : tuple of float
-        Ends of panels around each root, in half widths of it.
-    """
-
-    lowest: float = 1e-9
-    highest: float = 1e4
-    per_decade: int = 6
-    flanks: tuple[float, ...] = (-10.0, -3.0, -1.0, 1.0, 3.0, 10.0)
+    lowest: float = 1e-9  # end of a white spectrum, over the slowest pole
+    highest: float = 1e4  # its other end, over the fastest
+    per_decade: int = 6  # panels at least, as a curve is drawn through their ends
+    flanks: tuple[float, ...] = (-10.0, -3.0, -1.0, 1.0, 3.0, 10.0)  # in half widths of a root
 
 
 @dataclass(frozen=True)

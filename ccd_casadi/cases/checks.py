@@ -185,20 +185,23 @@ FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
-one_or_more = _good(
-    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
-    lambda value: bool(several(value)) and all(POSITIVE(v) is None for v in several(value)),
-    "give a number above 0, or a list of them",
+
+def _one_or_more(remedy: str, low: float = 0.0, high: float = math.inf) -> KeyCheck:
+    """A number above 0 from `low` to `high`, or a list of them."""
+
+    def good(value: Any) -> bool:
+        all_of = several(value)
+        return bool(all_of) and all(POSITIVE(v) is None and low <= v <= high for v in all_of)
+
+    return _good({"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]}, good, remedy)
+
+
+one_or_more = _one_or_more("give a number above 0, or a list of them")
+corners_hz = _one_or_more(
+    "give Hz from 0.01 to 1e7, or a list of them; leave out what is faster", 1e-2, 1e7
 )
-corners_hz = _good(
-    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
-    lambda value: one_or_more(value) is None and all(1e-2 <= v <= 1e7 for v in several(value)),
-    "give Hz from 0.01 to 1e7, or a list of them; leave out what is faster",
-)
-damping_ratios = _good(
-    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
-    lambda value: one_or_more(value) is None and all(1e-3 <= v <= 100.0 for v in several(value)),
-    "give a damping ratio from 0.001 to 100, or a list of them",
+damping_ratios = _one_or_more(
+    "give a damping ratio from 0.001 to 100, or a list of them", 1e-3, 100.0
 )
 _pair = every(POSITIVE, "", 2, 2)
 interval = _good(
@@ -239,16 +242,7 @@ numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
 def by_name(item: KeyCheck) -> KeyCheck:
-    """Make the check of a table whose values all pass a check.
-
-    Parameters
-    ----------
-    item : KeyCheck
-
-    Returns
-    -------
-    KeyCheck
-    """
+    """Make the check of a table whose values all pass a check."""
 
     def check(value: Any) -> str | None:
         if not isinstance(value, Mapping) or not value:

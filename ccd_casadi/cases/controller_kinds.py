@@ -23,21 +23,11 @@ from ccd_casadi.synthesis.weights import Weights
 
 @dataclass(frozen=True)
 class KindOptions:
-    """What a case has where it gives no number.
+    """What a case has where it gives no number."""
 
-    Attributes
-    ----------
-    shape : float
-        Bound of the shape of S with a fixed structure.
-    disturbance : float
-        W_d over M_K.
-    most_plants : int
-        Option sets of the plant that a case may list.
-    """
-
-    shape: float = 1.1
-    disturbance: float = 10.0
-    most_plants: int = 24
+    shape: float = 1.1  # bound of the shape of S with a fixed structure
+    disturbance: float = 10.0  # w_d over M_K
+    most_plants: int = 24  # option sets of the plant that a case may list
 
 
 WITH_DISTURBANCE = "h_infinity_disturbance"

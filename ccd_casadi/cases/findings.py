@@ -119,16 +119,7 @@ def unit_findings(
 
 
 def states_effort(problem: CoDesignProblem) -> bool:
-    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-
-    Returns
-    -------
-    bool
-    """
+    """Whether the case has an M_K; sections without weighted_level are scaled by one of ours."""
     kind = kind_of(problem)
     return not kind.as_designed or kind.bounds().weighted_level is not None
 
@@ -231,13 +222,7 @@ def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> l
 
 @dataclass(frozen=True)
 class MoveScale:
-    """What moves of machines stay below, in the unit of y and s.
-
-    Attributes
-    ----------
-    stroke, velocity, acceleration : float
-        Of a move.
-    """
+    """What moves of machines stay below, in the unit of y and s."""
 
     stroke: float
     velocity: float
@@ -246,31 +231,15 @@ class MoveScale:
 
 @dataclass(frozen=True)
 class PlausibilityOptions:
-    """Limits beyond which a question is written.
+    """Limits beyond which a question is written."""
 
-    Attributes
-    ----------
-    linear : MoveScale
-        m, m/s and m/s²: a long gantry, a fast linear motor, 100 times gravity.
-    rotary : MoveScale
-        rad, rad/s and rad/s²: 16 turns, 10,000 turns a minute, a galvanometer scanner.
-    longest : float
-        Of a move, s.
-    lightest, heaviest : float
-        Moving mass of a motor, over what it moves besides.
-    suits : float
-        Largest ω_b over the frequency at which M_K |G| = 1.
-    steepest : float
-        Power of the frequency with which |S| falls below ω_b: a free mass and an integrator have 3.
-    """
-
-    linear: MoveScale = MoveScale(5.0, 20.0, 1e3)
-    rotary: MoveScale = MoveScale(100.0, 1e3, 1e6)
-    longest: float = 60.0
-    lightest: float = 3e-3
-    heaviest: float = 10.0
-    suits: float = 1.1
-    steepest: float = 3.0
+    linear: MoveScale = MoveScale(5.0, 20.0, 1e3)  # m, m/s, m/s²: gantry, fast motor, 100 g
+    rotary: MoveScale = MoveScale(100.0, 1e3, 1e6)  # rad, ...: 16 turns, 10,000/min, scanner
+    longest: float = 60.0  # of a move, s
+    lightest: float = 3e-3  # moving mass of a motor, over what it moves besides
+    heaviest: float = 10.0  # the same
+    suits: float = 1.1  # largest ω_b over the frequency at which M_K |G| = 1
+    steepest: float = 3.0  # power of ω with which |S| falls below ω_b: free mass and integrator, 3
 
 
 def plausibility_findings(
@@ -279,19 +248,8 @@ def plausibility_findings(
     *,
     options: PlausibilityOptions = PlausibilityOptions(),
 ) -> list[CaseFinding]:
-    """Ask about a motor, a move and S_low of a problem that hardly any machine has.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-    facts : PlantFacts
-        At the start.
-    options : PlausibilityOptions
-
-    Returns
-    -------
-    list of CaseFinding
-        Warnings.
+    """Ask about a motor, a move and S_low of a problem that hardly any machine has; facts at the
+    start.
     """
     words = _low_words(problem, facts, options)
     if (motion := problem.source.motion) is not None:

@@ -25,24 +25,12 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class DiagnosisOptions:
-    """Numbers of the diagnosis of a plant.
+    """Numbers of the diagnosis of a plant."""
 
-    Attributes
-    ----------
-    most_corners : int
-        Corners of the box; of more this many are drawn.
-    with_derivatives : int
-        Points at which derivatives by differences are checked: start and middle.
-    hidden : float
-        Share of the largest gain below which a mode is not driven, or not measured.
-    coupled : float
-        Share of the modes' damping above which a damper connects two modes.
-    """
-
-    most_corners: int = 16
-    with_derivatives: int = 2
-    hidden: float = 1e-6
-    coupled: float = 1e-9
+    most_corners: int = 16  # of the box; of more this many are drawn
+    with_derivatives: int = 2  # points with derivatives by differences checked: start and middle
+    hidden: float = 1e-6  # share of the largest gain below which a mode is not driven or measured
+    coupled: float = 1e-9  # share of the modes' damping above which a damper connects two modes
 
 
 # in SI, by how a person writes them

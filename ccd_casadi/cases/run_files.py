@@ -101,22 +101,8 @@ def controller_of(path: Path, plant: ScaledPlant) -> StateSpace:
 
 
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
-    """Read the parameters of a fixed structure from the controller.json of a folder.
-
-    Parameters
-    ----------
-    folder : Path
-    structure : Structure or ChannelStructure
-
-    Returns
-    -------
-    tuple of float
-        κ in SI.
-
-    Raises
-    ------
-    UserError
-        It is of another structure.
+    """κ in SI of a fixed structure, from the controller.json of a folder. Raises UserError where it
+    is of another structure.
     """
     path = folder / "controller.json"
     words = f"is not a list of the {len(structure.names)} parameters of the case's structure"

@@ -63,21 +63,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunFolderOptions:
-    """Relative tolerances with which a run folder is read.
+    """Relative tolerances with which a run folder is read."""
 
-    Attributes
-    ----------
-    gamma : float
-        Difference of γ between two syntheses of the same problem on two machines.
-    bound : float
-        Excess of a bound of [inner] that counts as met.
-    norm : float
-        Excess of the norm over the stored bound.
-    """
-
-    gamma: float = 1e-3
-    bound: float = 1e-5
-    norm: float = 1e-6
+    gamma: float = 1e-3  # difference of γ between two syntheses of the same problem on two machines
+    bound: float = 1e-5  # excess of a bound of [inner] that counts as met
+    norm: float = 1e-6  # excess of the norm over the stored bound
 
 
 @dataclass(frozen=True)

@@ -23,21 +23,11 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class FixedOptions:
-    """Numbers of the formats.
+    """Numbers of the formats."""
 
-    Attributes
-    ----------
-    headroom : float
-        Of a range over the largest value of a move; what is beyond it saturates.
-    guards : tuple of (int, int)
-        Bits of a word, and bits behind a state's word at most: 32 or 60 bits are one state.
-    accumulator : int
-        Bits of a sum beside its sign, one left free.
-    """
-
-    headroom: float = 4.0
-    guards: tuple[tuple[int, int], ...] = ((16, 16), (32, 28))
-    accumulator: int = 62
+    headroom: float = 4.0  # of a range over a move's largest value; what is beyond it saturates
+    guards: tuple[tuple[int, int], ...] = ((16, 16), (32, 28))  # bits of a word, and behind
+    accumulator: int = 62  # bits of a sum beside its sign, one left free
 
 
 @dataclass(frozen=True)
@@ -68,29 +58,17 @@ Rows = tuple[tuple[Term, ...], ...]
 
 @dataclass(frozen=True)
 class FixedPoint:
-    """The integers of a controller with n states, p errors and m forces.
+    """The integers of a controller with n states, p errors and m forces."""
 
-    Attributes
-    ----------
-    bits, guard : int
-        Of a word, and of a state behind it.
-    states, errors, forces : array (n,), (p,), (m,)
-        SI in one count.
-    to_forces, to_states, at_start : tuple of rows of Term
-        Sums over z = [x; e; u - v]; at the start over [x; e; u], and X itself.
-    limits : tuple of int
-        Of each force.
-    """
-
-    bits: int
-    guard: int
-    states: Array
-    errors: Array
-    forces: Array
-    to_forces: Rows
-    to_states: Rows
-    at_start: Rows
-    limits: tuple[int, ...]
+    bits: int  # of a word
+    guard: int  # bits of a state behind its word
+    states: Array  # (n,) SI in one count
+    errors: Array  # (p,) the same
+    forces: Array  # (m,) the same
+    to_forces: Rows  # sums over z = [x; e; u - v]
+    to_states: Rows  # the same
+    at_start: Rows  # over [x; e; u], and X itself
+    limits: tuple[int, ...]  # of each force
 
     @property
     def largest(self) -> int:
@@ -203,25 +181,10 @@ def in_fixed(
     realisation: Realisation, ranges: Ranges, request: FixedRequest,
     options: FixedOptions = FixedOptions(),
 ) -> Realisation:  # fmt: skip
-    """Give a realisation in double precision its integers.
+    """The realisation with its integers, `system` and back-calculation as these are.
 
-    Parameters
-    ----------
-    realisation : Realisation
-    ranges : Ranges
-        Without headroom.
-    request : FixedRequest
-    options : FixedOptions
-
-    Returns
-    -------
-    Realisation
-        Its `system` and back-calculation are those of the integers.
-
-    Raises
-    ------
-    UserError
-        A step of the electronics is too fine for the range.
+    `realisation` is in double precision, `ranges` are without headroom. Raises UserError where a
+    step of the electronics is too fine for the range.
     """
     K, L, most = realisation.as_coded, realisation.back_calculation, 2 ** (request.bits - 1) - 1
     n, p, m = len(K.A), K.B.shape[1], len(K.C)

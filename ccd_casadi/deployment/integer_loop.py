@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
-from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware
+from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware, forward_gains
 from ccd_casadi.lti.ports import BreakPoint, course
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.arrays import Array
@@ -18,35 +18,19 @@ from ccd_casadi.support.text import spoken, with_unit
 
 @dataclass(frozen=True)
 class ResponseSumOptions:
-    """Numbers of a sum over an impulse response.
+    """Numbers of a sum over an impulse response."""
 
-    Attributes
-    ----------
-    block : int
-        Samples at once.
-    share : float
-        Of the sum, that the rest may be.
-    most : int
-        Blocks at most; beyond them nothing is known.
-    """
-
-    block: int = 256
-    share: float = 1e-3
-    most: int = 20_000
+    block: int = 256  # samples at once
+    share: float = 1e-3  # of the sum, that the rest may be
+    most: int = 20_000  # blocks at most; beyond them nothing is known
 
 
 @dataclass(frozen=True)
 class RoundingBound:
-    """What rounding adds.
+    """What rounding adds."""
 
-    Attributes
-    ----------
-    bits, errors : int, array (p,)
-        Of a word; largest movement of each sensor, its unit. Infinite where it is not known.
-    """
-
-    bits: int
-    errors: Array
+    bits: int  # of a word
+    errors: Array  # (p,) largest movement of each sensor, its unit; infinite where not known
 
     @property
     def largest(self) -> float:
@@ -60,20 +44,8 @@ def ranges_of_moves(
 ) -> Ranges:  # fmt: skip
     """Largest values in moves of every axis, with feedforward where there is one and without.
 
-    Parameters
-    ----------
-    plant, held : StateSpace
-        u to y in SI, and the same behind hold and delay.
-    K : StateSpace
-        As it runs, SI.
-    profile : Setpoint
-    forward : (5, m, p) array or None
-    places : sequence of BreakPoint
-        Of several sensors on one actuator.
-
-    Returns
-    -------
-    Ranges
+    `plant` is from u to y in SI, `held` the same behind hold and delay, `K` as it runs; `forward`
+    is (5, m, p), `places` are of several sensors on one actuator.
     """
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     count = int(np.ceil(2.0 * profile.duration / held.period))
@@ -92,26 +64,6 @@ def ranges_of_moves(
                 peaks = np.maximum(peaks, np.abs(np.concatenate([z, e, u])))
                 x, z = held.A @ x + held.B @ u, K.A @ z + K.B @ e
     return Ranges(peaks[:n], peaks[n : n + p], peaks[n + p :])
-
-
-def forward_gains(
-    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
-) -> Array:
-    """Feedforward of a setpoint's position and derivatives.
-
-    Parameters
-    ----------
-    forward : (5, m, p) array
-    reference : array (p,)
-        As of `course`.
-    axis : int
-    places : sequence of BreakPoint
-
-    Returns
-    -------
-    array (5, m)
-    """
-    return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 
 def rounding_bound(

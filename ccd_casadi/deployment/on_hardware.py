@@ -23,24 +23,12 @@ from ccd_casadi.support.text import inwards
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Numbers of a simulated move.
+    """Numbers of a simulated move."""
 
-    Attributes
-    ----------
-    parts : int
-        Of a period, that a jitter is a multiple of: few steps to compute.
-    tail : float
-        Time after the setpoint's end that is simulated, over its duration.
-    watched : float
-        Last share of the simulation, where a limit cycle is seen.
-    shares : tuple of float
-        Force limits that are tried, over the peak force.
-    """
-
-    parts: int = 20
-    tail: float = 3.0
-    watched: float = 0.25
-    shares: tuple[float, ...] = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
+    parts: int = 20  # of a period, that a jitter is a multiple of: few steps to compute
+    tail: float = 3.0  # time after the setpoint's end that is simulated, over its duration
+    watched: float = 0.25  # last share of the simulation, where a limit cycle is seen
+    shares: tuple[float, ...] = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of the peak force
 
 
 @dataclass(frozen=True)
@@ -113,8 +101,7 @@ def move(
     wanted, (output, reference) = profile.at(time), course(plant, axis, places)
     ahead = np.zeros((count, m))
     if forward is not None:
-        own = forward @ reference if places else forward[:, :, axis]
-        ahead = wanted.T @ own
+        ahead = wanted.T @ forward_gains(forward, reference, axis, places)
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
@@ -197,6 +184,13 @@ def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, b
         return u, bool(np.any(u != v))
 
     return in_floats
+
+
+def forward_gains(
+    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
+) -> Array:
+    """Feedforward (5, m) of a setpoint's derivatives; `reference` (p,) as of `course`."""
+    return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 
 def forward_of(

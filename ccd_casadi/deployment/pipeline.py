@@ -67,34 +67,17 @@ class DeploymentOptions:
 
     A reduced controller keeps S_max and a bound on the compliance to 0.5 %: they bind at most
     optima, where any change exceeds them a little.
-
-    Attributes
-    ----------
-    sampled_excess, sampled_bandwidth : float
-        Relative, of S_max and ω_b: of the sampled loop.
-    designed_excess : float
-        Relative, of S_max: of a loop that was designed as sampled.
-    reduced_peak, reduced_bandwidth : float
-        Over S_max and ω_b: of the loop with a reduced controller.
-    reduced_norm : float
-        Largest weighted norm over the γ of the design.
-    strict : float
-        Relative: S_max kept as the design itself keeps it.
-    least_rate : float
-        Samples in a period of ω_b.
-    added_plants : int
-        Plants between those of the case's set that may be added to it for the rate.
     """
 
-    sampled_excess: float = 0.05
-    sampled_bandwidth: float = 0.03
-    designed_excess: float = 1e-3
-    reduced_peak: float = 1.005
-    reduced_bandwidth: float = 0.99
-    reduced_norm: float = 2.0
-    strict: float = 1e-6
-    least_rate: float = 4.0
-    added_plants: int = 5
+    sampled_excess: float = 0.05  # of S_max, relative: of the sampled loop
+    sampled_bandwidth: float = 0.03  # of ω_b, relative
+    designed_excess: float = 1e-3  # of S_max, relative: of a loop that was designed as sampled
+    reduced_peak: float = 1.005  # over S_max: of the loop with a reduced controller
+    reduced_bandwidth: float = 0.99  # over ω_b
+    reduced_norm: float = 2.0  # largest weighted norm over the γ of the design
+    strict: float = 1e-6  # relative: S_max kept as the design itself keeps it
+    least_rate: float = 4.0  # samples in a period of ω_b
+    added_plants: int = 5  # between those of the case's set, that may be added to it for the rate
 
 
 def at_its_rate(

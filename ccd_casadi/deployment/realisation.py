@@ -83,17 +83,8 @@ class Realisation:
 
 
 def in_single(realisation: Realisation) -> Realisation:
-    """The same in single precision: what is judged from here on has the rounded coefficients.
-
-    Parameters
-    ----------
-    realisation : Realisation
-        In double precision.
-
-    Returns
-    -------
-    Realisation
-        Every coefficient is the number of 24 bits nearest to it, in a double.
+    """The same in single precision: every coefficient is the nearest number of 24 bits, in a
+    double. What is judged from here on has these.
     """
 
     def rounded(M: Array) -> Array:

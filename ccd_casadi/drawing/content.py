@@ -399,20 +399,11 @@ class Facts:
 
 @dataclass(frozen=True)
 class Steps:
-    """Figures of which a slider shows one at a time.
-
-    Attributes
-    ----------
-    steps : tuple of (text, Lines)
-    first : int
-        Index of the one that is shown at first.
-    label : str
-        Of the slider.
-    """
+    """Figures of which a slider shows one at a time."""
 
     steps: tuple[tuple[str, Lines], ...]
-    first: int
-    label: str
+    first: int  # index of the one that is shown at first
+    label: str  # of the slider
 
 
 @dataclass(frozen=True)
@@ -439,21 +430,11 @@ class VerdictRow:
 
 @dataclass(frozen=True)
 class Bars:
-    """A table whose rows end in a bar, the longest first.
+    """A table whose rows end in a bar, the longest first."""
 
-    Attributes
-    ----------
-    head : tuple of str
-        Names of the columns; the bar's is the last.
-    rows : tuple of tuple
-        Values, without the bar.
-    lengths : tuple of float
-        Of the bars; negative ones have another colour.
-    """
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-    lengths: tuple[float, ...]
+    head: tuple[str, ...]  # names of the columns; the bar's is the last
+    rows: tuple[tuple[Any, ...], ...]  # values, without the bar
+    lengths: tuple[float, ...]  # of the bars; negative ones have another colour
 
     @property
     def table(self) -> Table:
@@ -469,17 +450,10 @@ class Bars:
 
 @dataclass(frozen=True)
 class FoldedBlocks:
-    """Blocks behind a line that opens them; printed pages show them.
-
-    Attributes
-    ----------
-    summary : str
-    body : tuple
-        Of facts, tables and words.
-    """
+    """Blocks behind a line that opens them; printed pages show them."""
 
     summary: str
-    body: tuple[Words | Bullets | Facts | Table | Source, ...]
+    body: tuple[Words | Bullets | Facts | Table | Source, ...]  # of facts, tables and words
 
 
 @dataclass(frozen=True)

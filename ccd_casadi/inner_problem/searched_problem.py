@@ -18,47 +18,25 @@ Scenario = tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True)
 class WarmStartOptions:
-    """How many warm starts a state keeps.
+    """How many warm starts a state keeps."""
 
-    Attributes
-    ----------
-    found : int
-        Of a multi-start search.
-    kept : int
-        With one that is added.
-    """
-
-    found: int = 3
-    kept: int = 4
+    found: int = 3  # of a multi-start search
+    kept: int = 4  # with one that is added
 
 
 @dataclass(frozen=True)
 class SearchState:
-    """What a search has found.
+    """What a search has found."""
 
-    Attributes
-    ----------
-    warm_starts, error_warm_starts : tuple of κ in SI
-        Of the largest bandwidth; of the least RMS error or move time.
-    scenarios : tuple of (option, point of the box)
-    seed : int
-        Of the multi-start search that finds them.
-    """
-
-    warm_starts: tuple[tuple[float, ...], ...] = ()
-    error_warm_starts: tuple[tuple[float, ...], ...] = ()
-    scenarios: tuple[Scenario, ...] = ()
-    seed: int = 0
+    warm_starts: tuple[tuple[float, ...], ...] = ()  # κ (SI) of the largest bandwidth
+    error_warm_starts: tuple[tuple[float, ...], ...] = ()  # of the least error or time
+    scenarios: tuple[Scenario, ...] = ()  # options and points of the box
+    seed: int = 0  # of the multi-start search that finds them
 
 
 @dataclass(frozen=True)
 class SearchedProblem(CoDesignProblem):
-    """A statement with the state of a search for it.
-
-    Attributes
-    ----------
-    state : SearchState
-    """
+    """A statement with the state of a search for it."""
 
     state: SearchState = field(default_factory=SearchState)
 

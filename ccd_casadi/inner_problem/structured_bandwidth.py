@@ -114,18 +114,8 @@ def exact_moves(motion: MotionAt, loops: Sequence[Loop]) -> list[Move]:
 def exact_times(
     problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
 ) -> Array:
-    """Simulate the move on plants: the time until the error stays within the window.
-
-    Parameters
-    ----------
-    problem, motion : CoDesignProblem, MotionAt
-    plants, K : sequence of ScaledPlant, StateSpace
-        K(s) in SI.
-
-    Returns
-    -------
-    array (plants,)
-        s from the start of the move, its end at least.
+    """Simulate the move on plants with K(s): the time in s from its start until the error stays
+    within the window, its end at least.
     """
     made = exact_moves(motion, [Loop(plant.plant_si(), K, problem.sampling) for plant in plants])
     return np.maximum([move.settled for move in made], motion.cycle.profile.duration)

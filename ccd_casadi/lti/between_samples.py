@@ -32,21 +32,11 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class BetweenOptions:
-    """Numbers of the search between the samples.
+    """Numbers of the search between the samples."""
 
-    Attributes
-    ----------
-    times : int
-        Of a period at which S_τ is evaluated, evenly spread from the instant on.
-    near : float
-        Share of the largest value: lower local maxima are not refined.
-    plants : int
-        Of a set: those with the largest peaks at the instants.
-    """
-
-    times: int = 8
-    near: float = 0.9
-    plants: int = 12
+    times: int = 8  # of a period at which S_τ is evaluated, evenly spread from the instant on
+    near: float = 0.9  # share of the largest value: lower local maxima are not refined
+    plants: int = 12  # of a set: those with the largest peaks at the instants
 
 
 @dataclass(frozen=True)
@@ -80,23 +70,10 @@ class BetweenSamples:
 
 
 def held_between(G: StateSpace, period: float, delay: float, times: Sequence[float]) -> StateSpace:
-    """Discretise a plant behind hold and delay, u_k to y(kT + τ) for several τ.
+    """Discretise a plant behind hold and delay, u_k to y(kT + τ) for N times τ in s, 0 <= τ <= T.
 
-    u_{k-d-1} acts until the rest of the delay is over, then u_{k-d}.
-
-    Parameters
-    ----------
-    G : StateSpace
-        Continuous, without feedthrough, p outputs.
-    period, delay : float
-        s.
-    times : sequence of float (N,)
-        τ in s, 0 <= τ <= T.
-
-    Returns
-    -------
-    StateSpace
-        With N p outputs, those of the first τ first.
+    u_{k-d-1} acts until the rest of the delay is over, then u_{k-d}. `G` is continuous, without
+    feedthrough; of its p outputs there are N p, those of the first τ first.
     """
     held, (n, m) = sampled(G, period, delay), G.B.shape
     whole, rest = delay_parts(period, delay)
@@ -120,23 +97,10 @@ def held_between(G: StateSpace, period: float, delay: float, times: Sequence[flo
 def sensitivity_between(
     loop: Loop, omega: Array, place: BreakPoint | None = None, times: int = BetweenOptions.times
 ) -> np.ndarray:
-    """Evaluate S_τ of a sampled loop.
+    """Evaluate S_τ (N, k, p, p) of a sampled loop with a continuous plant at N times τ = 0, T/N, …
 
-    Parameters
-    ----------
-    loop : Loop
-        With its sampling; its plant is continuous.
-    omega : array (k,)
-        rad/s, below half the rate.
-    place : BreakPoint, optional
-        Of several sensors on one actuator: the one that is disturbed and read.
-    times : int
-        N: τ = 0, T/N, …
-
-    Returns
-    -------
-    complex array (N, k, p, p)
-        Of one sensor (N, k, 1, 1).
+    `omega` (k,) is in rad/s, below half the rate. Of several sensors on one actuator `place` is the
+    one that is disturbed and read, and S_τ is (N, k, 1, 1).
     """
     assert loop.sampling is not None
     T, p = loop.sampling.period, len(loop.plant.C)
@@ -155,18 +119,8 @@ def sensitivity_between(
 def peak_between(loop: Loop, options: BetweenOptions = BetweenOptions()) -> BetweenSamples:
     """Find the largest σ_max(S_τ) of a stable sampled loop over frequency and τ.
 
-    Its grid goes through the poles of plant, controller and loop; local maxima are refined.
-
-    Parameters
-    ----------
-    loop : Loop
-        Of several sensors: where the error counts, `loop.at[0]`.
-    options : BetweenOptions
-
-    Returns
-    -------
-    BetweenSamples
-        Found on a grid of frequencies and times: no level test is of it.
+    Its grid goes through the poles of plant, controller and loop; local maxima are refined, and no
+    level test is of it. Of several sensors S_τ is where the error counts, `loop.at[0]`.
     """
     place = loop.at[0] if loop.at and loop.at[0].output else None
 

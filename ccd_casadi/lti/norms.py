@@ -17,29 +17,15 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class NormOptions:
-    """Numbers of the computation of the H∞ norm.
+    """Numbers of the computation of the H∞ norm."""
 
-    Attributes
-    ----------
-    near_axis : float
-        |Re λ|/|λ| up to which an eigenvalue is a candidate; a spurious one costs an evaluation.
-    resolution : float
-        Relative step of the level.
-    rounds : int
-        Largest number of steps.
-    climbed : float
-        Relative: how far below the largest a maximum of the first grid is climbed, too.
-    climbs, divisions, points : int
-        Maxima that are climbed, times that the bracket of each is divided, into how many points.
-    """
-
-    near_axis: float = 1e-3
-    resolution: float = 1e-10
-    rounds: int = 40
-    climbed: float = 0.1
-    climbs: int = 4
-    divisions: int = 4
-    points: int = 41
+    near_axis: float = 1e-3  # |Re λ|/|λ| of a candidate at most; a spurious one costs an evaluation
+    resolution: float = 1e-10  # relative step of the level
+    rounds: int = 40  # largest number of steps
+    climbed: float = 0.1  # relative: how far below the largest a maximum is climbed, too
+    climbs: int = 4  # maxima that are climbed
+    divisions: int = 4  # times that the bracket of each is divided
+    points: int = 41  # of the bracket at each division
 
 
 def gains(system: StateSpace, omega: Array, *, memory: int = 1_000_000) -> Array:

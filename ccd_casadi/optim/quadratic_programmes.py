@@ -40,17 +40,8 @@ def solve_quadratic(
 ) -> QuadraticSolution | None:  # fmt: skip
     """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper, by DAQP, or else by Clarabel.
 
-    Parameters
-    ----------
-    H, c, A, upper : array (n, n), (n,), (m, n), (m,)
-        H is positive semidefinite and may be nearly singular.
-    low, high : array (n,)
-        May be infinite.
-
-    Returns
-    -------
-    QuadraticSolution or None
-        None where neither solver returns a feasible x. It does not prove that there is none.
+    H (n, n) is positive semidefinite and may be nearly singular, bounds may be infinite. None where
+    neither solver returns a feasible x, which does not prove that there is none.
     """
     (m, n), unbounded = A.shape, options.unbounded
 

@@ -46,34 +46,16 @@ def remembered(
 
 @dataclass(frozen=True)
 class DifferenceOptions:
-    """Numbers of derivatives by differences.
+    """Numbers of derivatives by differences."""
 
-    Attributes
-    ----------
-    step : float
-        Share of the box: h⁴ is 1e-12, and rounding is magnified a thousandfold.
-    values_kept : int
-        θ whose values are kept: matrices and hardware cost are evaluated at the same ones.
-    wrong : float
-        Relative disagreement of two difference formulas from which a derivative is wrong.
-    jump : float
-        Share of a matrix by which its values differ over one step where they jump.
-    noise : float
-        Share of a matrix over the box below which a derivative counts as zero.
-    agreement : float
-        Relative difference between the values of symbols and of numbers.
-    corners, inside : int
-        θ where these are compared, besides the middle: corners of the box at most, and inside.
-    """
-
-    step: float = 1e-3
-    values_kept: int = 256
-    wrong: float = 0.1
-    jump: float = 1e-2
-    noise: float = 1e-4
-    agreement: float = 1e-9
-    corners: int = 16
-    inside: int = 6
+    step: float = 1e-3  # share of the box: h⁴ is 1e-12, and rounding is magnified a thousandfold
+    values_kept: int = 256  # θ: matrices and hardware cost are evaluated at the same ones
+    wrong: float = 0.1  # relative: two difference formulas differ by more of a wrong derivative
+    jump: float = 1e-2  # share of a matrix by which its values differ over one step where they jump
+    noise: float = 1e-4  # share of a matrix over the box below which a derivative counts as zero
+    agreement: float = 1e-9  # relative difference between the values of symbols and of numbers
+    corners: int = 16  # of the box at most, where these are compared, besides the middle
+    inside: int = 6  # places inside it, too
 
 
 def user_plant(

@@ -46,27 +46,13 @@ class Material:
 
 @dataclass(frozen=True)
 class KrylovOptions:
-    """Numbers of the block Krylov methods.
+    """Numbers of the block Krylov methods."""
 
-    Attributes
-    ----------
-    block : int
-        Vectors of a block with which modes are searched.
-    most_blocks : int
-        Blocks of a space.
-    mode_residual : float
-        Relative residual of a mode.
-    solution_residual : float
-        Relative residual of the solution with the resolvent.
-    rounding : float
-        Share of the operator's norm below which a direction of a block is dropped.
-    """
-
-    block: int = 3
-    most_blocks: int = 200
-    mode_residual: float = 1e-11
-    solution_residual: float = 1e-10
-    rounding: float = 1e-13
+    block: int = 3  # vectors of a block with which modes are searched
+    most_blocks: int = 200  # of a space
+    mode_residual: float = 1e-11  # relative, of a mode
+    solution_residual: float = 1e-10  # relative, of the solution with the resolvent
+    rounding: float = 1e-13  # of the operator's norm: below, a direction of a block is dropped
 
 
 class StageError(UserError):

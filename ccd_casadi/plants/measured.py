@@ -19,27 +19,13 @@ DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
 
 @dataclass(frozen=True)
 class MeasuredResponseOptions:
-    """Numbers by which a measured response is read.
+    """Numbers by which a measured response is read."""
 
-    Attributes
-    ----------
-    decades_below : int
-        Decades that a response is extrapolated below its first line.
-    per_decade : int
-        Lines a decade of that.
-    derivative_gap : float
-        Largest distance of slope (1) and angle (rad) from those of a time derivative.
-    first_lines : float
-        Factor of the first line: up to there the slope gives the number of poles at 0.
-    peak : float
-        Prominence of a resonance in ln |G|.
-    """
-
-    decades_below: int = 3
-    per_decade: int = 25
-    derivative_gap: float = 0.35
-    first_lines: float = 1.5
-    peak: float = 1.0
+    decades_below: int = 3  # that a response is extrapolated below its first line
+    per_decade: int = 25  # lines of that
+    derivative_gap: float = 0.35  # of slope (1) and angle (rad) from a time derivative's at most
+    first_lines: float = 1.5  # over the first: up to there the slope gives the poles at 0
+    peak: float = 1.0  # prominence of a resonance in ln |G|
 
 
 @dataclass(frozen=True)

@@ -27,21 +27,11 @@ _KNOWN = {*_REQUIRED, *PORTS, "damping", "damping_ratio", "constraints"}
 
 @dataclass(frozen=True)
 class PlantOptions:
-    """Sizes beyond which a plant is refused.
+    """Sizes beyond which a plant is refused."""
 
-    Attributes
-    ----------
-    most_coordinates : int
-        Rows of M: matrices are dense, and the time of a synthesis grows with the cube.
-    most_channels : int
-        Inputs, and outputs.
-    largest_entry : float
-        Of any matrix or derivative, SI: its square is still a double.
-    """
-
-    most_coordinates: int = 1000
-    most_channels: int = 100
-    largest_entry: float = 1e100
+    most_coordinates: int = 1000  # rows of M, which is dense: the time grows with the cube
+    most_channels: int = 100  # inputs, and outputs
+    largest_entry: float = 1e100  # of any matrix or derivative, SI: its square is still a double
 
 
 def widened(model: ModelFunction) -> ModelFunction:

@@ -84,18 +84,8 @@ class Rise:
 
 
 def rise_of(hz: Array, F: np.ndarray, options: DirectionOptions = DirectionOptions()) -> Rise:
-    """Find the largest lasting rise of an angle above the least one.
-
-    Parameters
-    ----------
-    hz : array (k,)
-    F : array (k,)
-        G of one channel, or det G.
-    options : DirectionOptions
-
-    Returns
-    -------
-    Rise
+    """Find the largest lasting rise of the angle of F (k,), G of one channel or det G, above its
+    least.
     """
     if not F.all():
         return Rise(0.0, np.nan, np.nan)
@@ -138,19 +128,8 @@ def _largest_rise(above: Array, lasting: int) -> tuple[float, int, int]:
 def poles_at_peaks(
     hz: Array, G: np.ndarray, peaks: np.ndarray, options: DirectionOptions = DirectionOptions()
 ) -> Iterator[tuple[float, bool]]:
-    """The resonances whose direction the lines show.
-
-    Parameters
-    ----------
-    hz, G : array (k,), array (k, p, m)
-    peaks : array of int
-        Lines of the peaks of |G|.
-    options : DirectionOptions
-
-    Yields
-    ------
-    float, bool
-        Hz; whether the phase rises there, as at a pole in the right half plane.
+    """The resonances whose direction the lines show: Hz, and whether the phase rises there, as at a
+    pole in the right half plane. G is (k, p, m), `peaks` the lines of the peaks of |G|.
     """
     for peak in peaks.tolist():
         entry = np.unravel_index(np.abs(G[peak]).argmax(), G[peak].shape)
@@ -190,21 +169,10 @@ def turned_words(
     hz: Array, G: np.ndarray, peaks: np.ndarray, unstable_poles: int,
     options: DirectionOptions = DirectionOptions(),
 ) -> str:  # fmt: skip
-    """Where the phase of a response rises as of no stable causal plant, in words.
+    """Where the phase of a response rises as of no stable causal plant, in words; empty where it
+    does not.
 
-    Parameters
-    ----------
-    hz, G : array (k,), array (k, p, m)
-    peaks : array of int
-        Lines of the peaks of |G|.
-    unstable_poles : int
-        Of the plant, as they are stated.
-    options : DirectionOptions
-
-    Returns
-    -------
-    str
-        Empty where it does not.
+    G is (k, p, m), `peaks` the lines of the peaks of |G|, the unstable poles those that are stated.
     """
     found = list(poles_at_peaks(hz, G, peaks, options))
     rising = sorted(at for at, rises in found if rises)

@@ -1,7 +1,8 @@
 """Tables of a frequency response: what each column means, exactly, or a refusal that names it.
 
 A column that may change the plant and is not understood is refused. Two readings that are both
-possible (radians under the name of degrees, decibels under that of magnitude) are refused too.
+possible (radians under the name of degrees, decibels under that of magnitude) are refused too. Of
+universal files dataset 58 is read, ASCII or binary, by pyuff.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,46 +26,116 @@ from ccd_casadi.plants.table_columns import (
     npz_arrays,
     rate_order,
 )
-from ccd_casadi.plants.universal_file import SUFFIXES, columns_of_universal
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import UserError, described, require
 from ccd_casadi.support.json_files import mat_variables
+
+SUFFIXES = (".uff", ".unv", ".uf", ".bunv")
+
+
+@dataclass(frozen=True)
+class DatasetCodes:
+    """Codes of dataset 58 (SDRL, University of Cincinnati)."""
+
+    response_function: int = 4  # function type of an FRF
+    frequency: int = 18  # specific data type of an abscissa in Hz
+    force: int = 13  # that of a force
+    SI: int = 1  # code of dataset 164
+
+
+# by the specific data type of the ordinate: what it is, and units of it over N by label
+ORDINATES: Mapping[int, tuple[str, Mapping[str, str]]] = {
+    8: ("displacement", {"": "m/N", "m": "m/N", "mm": "mm/N", "um": "um/N", "nm": "nm/N"}),
+    11: ("velocity", {"": "m/s/N", "m/s": "m/s/N"}),
+    12: ("acceleration", dict.fromkeys(("", "m/s^2", "m/s2", "m/s²", "m/s**2"), "m/s^2/N")),
+}  # fmt: skip
+FUNCTIONS = {1: "time responses", 2: "auto spectra", 3: "cross spectra", 6: "coherences",
+             9: "power spectral densities"}  # fmt: skip
+
+
+def columns_of_universal(
+    path: Path, codes: DatasetCodes = DatasetCodes()
+) -> tuple[list[TableColumn], list[str]]:
+    """Read the only frequency response of a universal file: f_hz, G with its unit, what is to be
+    reported.
+
+    Raises UserError where pyuff is not installed, or the file holds no single response over a force
+    that is understood.
+    """
+    pyuff = require("pyuff", "uff")
+    if not path.exists():
+        raise UserError(f"{path}: cannot be read: no such file")
+    try:
+        file = pyuff.UFF(str(path))
+        kinds = [int(kind) for kind in file.get_set_types()]
+        at = [i for i, kind in enumerate(kinds) if kind == 58]
+        sets = [file.read_sets(i) for i in at]
+        units = [file.read_sets(i) for i, kind in enumerate(kinds) if kind == 164]
+    except Exception as error:  # a damaged file fails anywhere inside the reader
+        raise UserError(f"{path}: is not a readable universal file: {described(error)}") from None
+    found = [one for one in sets if int(one["func_type"]) == codes.response_function]
+    if len(found) != 1:
+        other = [FUNCTIONS.get(int(one["func_type"]), "other functions") for one in sets]
+        other += [f"dataset {kind}" for kind in kinds if kind != 58]
+        each = [_place(one) for one in found[:4]] or list(dict.fromkeys(other))[:6]
+        words = f"holds {len(found)} frequency responses of dataset 58 ({', '.join(each)})"
+        raise UserError(f"{path}: {words}; write one a file")
+    one, notes = found[0], [_place(found[0])]
+    foreign = next((item for item in units if int(item["units_code"]) != codes.SI), None)
+    if foreign is not None:
+        named = str(foreign.get("units_description", "")).strip() or foreign["units_code"]
+        words = f"dataset 164 has the units {named}, and the response may be in these or in SI"
+        raise UserError(f"{path}: {words}; write it in SI")
+    if int(one["abscissa_spec_data_type"]) != codes.frequency:
+        raise UserError(f"{path}: its abscissa is not a frequency; write a response over Hz")
+    over, force = int(one["orddenom_spec_data_type"]), _label(one, "orddenom")
+    kind, unit = int(one["ordinate_spec_data_type"]), _label(one, "ordinate")
+    if over != codes.force or force not in ("", "n"):
+        what = force or (f"data type {over}" if over else "what its header does not name")
+        words = f"is over {what}, not over a force in N"
+        raise UserError(f"{path}: {words}; write it over N")
+    if kind not in ORDINATES:
+        raise UserError(f"{path}: its data type {kind} is not a displacement, velocity or "
+                        "acceleration; write one of them")  # fmt: skip
+    name, known = ORDINATES[kind]
+    if unit not in known:
+        raise UserError(f"{path}: {unit!r} is not understood as a unit of {name}; it may be "
+                        f"{', '.join(key for key in known if key)}")  # fmt: skip
+    if not unit:
+        notes.append(f"{name} in SI, as no unit is named")
+    if len(sets) > 1:
+        notes.append(f"{len(sets) - 1} other functions are left out")
+    G, hz = np.asarray(one["data"], complex), np.asarray(one["x"], float)
+    return [TableColumn("f_hz", hz), TableColumn(f"G ({known[unit]})", G)], notes
+
+
+def _label(one: Mapping[str, Any], of: str) -> str:
+    """The unit of an axis in small letters; empty where none is named."""
+    text = str(one.get(f"{of}_axis_units_lab") or "").strip().casefold()
+    return "" if text == "none" else text
+
+
+def _place(one: Mapping[str, Any]) -> str:
+    """Where a response was measured, as its file has it."""
+    ends = [f"{one[f'{of}_node']}:{int(one[f'{of}_dir']):+d}" for of in ("rsp", "ref")]
+    return f"node and direction {ends[0]} over {ends[1]}"
+
 
 BESIDE = ("spread", "coherence", "averages")
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """Numbers of the test whether the units of magnitude and phase are as stated.
+    """Numbers of the test whether the units of magnitude and phase are as stated."""
 
-    Attributes
-    ----------
-    few_degrees : float
-        A phase within ± this many degrees may as well be in radians.
-    many_radians : float
-        A phase beyond ± this many radians may as well be in degrees.
-    bode_points : int
-        Points over ln f at which Bode's gain-phase relation is evaluated.
-    bode_delays : int
-        Delays that are tried with it.
-    bode_misfit : float
-        Mean misfit of the relation in rad beyond which a reading is doubted.
-    bode_gain : float
-        Share of the misfit below which another reading is as likely.
-    end : float
-        Factor of the first and the last line within which the slope beyond them is read.
-    confidence : float
-        Of a spread that coherence and averages give.
-    """
-
-    few_degrees: float = 30.0
-    many_radians: float = 4.0 * np.pi
-    bode_points: int = 200
-    bode_delays: int = 60
-    bode_misfit: float = float(np.radians(20.0))
-    bode_gain: float = 0.85
-    end: float = 1.5
-    confidence: float = 0.95
+    few_degrees: float = 30.0  # a phase within ± as many degrees may be in radians
+    many_radians: float = 4.0 * np.pi  # a phase beyond ± as many radians may be in degrees
+    bode_points: int = 200  # over ln f, at which Bode's gain-phase relation is evaluated
+    bode_delays: int = 60  # that are tried with it
+    bode_misfit: float = float(np.radians(20.0))  # rad, in the mean: beyond it a reading is doubted
+    bode_gain: float = 0.85  # share of the misfit below which another reading is as likely
+    end: float = 1.5  # factor of the end lines within which the slope beyond them is read
+    confidence: float = 0.95  # of a spread that coherence and averages give
 
 
 @dataclass(frozen=True)

@@ -30,27 +30,13 @@ EPS = float(np.finfo(float).eps)
 
 @dataclass(frozen=True)
 class RigidModeOptions:
-    """Numbers that decide which modes are rigid.
+    """Numbers that decide which modes are rigid."""
 
-    Attributes
-    ----------
-    rounding : float
-        Times n ε: eigenvalues of K' below it may be rounding of zero.
-    known : float
-        Eigenvalue of K' from which on K resists: its λ is known to n ε/known.
-    stated : float
-        Eigenvalue of K' up to which a motion is rigid where the case states their number.
-    hidden : float
-        Relative gain below which a rigid body is not driven, or not measured.
-    stiff : float
-        λ_max/λ_min from which on low modes are found by the inverse.
-    """
-
-    rounding: float = 100.0
-    known: float = 1e-10
-    stated: float = 1e-3
-    hidden: float = 1e-9
-    stiff: float = 1e8
+    rounding: float = 100.0  # times n ε: eigenvalues of K' below it may be rounding of zero
+    known: float = 1e-10  # eigenvalue of K' from which on K resists: its λ is known to n ε/known
+    stated: float = 1e-3  # eigenvalue of K' of a rigid motion at most, where their number is stated
+    hidden: float = 1e-9  # relative gain below which a rigid body is not driven, or not measured
+    stiff: float = 1e8  # λ_max/λ_min from which on low modes are found by the inverse
 
 
 def natural_modes(

@@ -377,21 +377,8 @@ def meaning_of(name: str) -> tuple[str, str] | None:
 
 
 def rate_order(path: Path, name: str) -> int:
-    """Find of which derivative of a displacement a column of a response is.
-
-    Parameters
-    ----------
-    path, name : Path, str
-
-    Returns
-    -------
-    int
-        0: receptance, 1: mobility, 2: accelerance, by its name or its unit.
-
-    Raises
-    ------
-    UserError
-        Its name and its unit differ.
+    """Find of which derivative of a displacement a column of a response is, by its name or its
+    unit: 0 receptance, 1 mobility, 2 accelerance. Raises UserError where the two differ.
     """
     base = re.split(r"[ _(\[]", name.strip().casefold())[0]
     found = meaning_of(name)

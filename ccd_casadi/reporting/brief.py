@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from ccd_casadi.reporting.concerns import lines_of, percent_words, risks, what_i
 from ccd_casadi.reporting.decision import Build, Decision, decide
 from ccd_casadi.reporting.facts import (
     binding,
+    change_words,
     cost_words,
     requirement_place,
     requirement_words,
@@ -41,38 +43,23 @@ from ccd_casadi.reporting.nyquist import nyquist_panel
 from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
 from surrogates.files import write_whole
 
+_change = partial(change_words, digits=1, none="unchanged")
 NAME = "brief.html"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
 
 
 @dataclass(frozen=True)
 class BriefOptions:
-    """What the brief asks of the design.
+    """What the brief asks of the design."""
 
-    Attributes
-    ----------
-    limits, risks, requirements : int
-        Of each at most; requirements are those with the least left.
-    shift : float
-        Of all resonances, relative: "3 % lower".
-    gain : float
-        Of the whole plant, relative.
-    resonances : int
-        That are compared before and after.
-    height : float
-        Of |S|, inches.
-    print_seconds : float
-        For a browser to write the PDF.
-    """
-
-    limits: int = 3
-    risks: int = 3
-    requirements: int = 7
-    shift: float = 0.03
-    gain: float = 0.1
-    resonances: int = 3
-    height: float = 2.9
-    print_seconds: float = 60.0
+    limits: int = 3  # at most
+    risks: int = 3  # at most
+    requirements: int = 7  # at most, those with the least left
+    shift: float = 0.03  # of all resonances, relative: "3 % lower"
+    gain: float = 0.1  # of the whole plant, relative
+    resonances: int = 3  # that are compared before and after
+    height: float = 2.9  # of |S|, inches
+    print_seconds: float = 60.0  # for a browser to write the PDF
 
 
 @dataclass(frozen=True)
@@ -165,8 +152,7 @@ def before_and_after(run: FinishedRun, options: BriefOptions) -> Iterator[Before
         before, after = (f"{number(factor * v)} {shown}".strip() for v in (before_value, value))
         yield BeforeAfter(name, before, after, _change(before_value, value))
     for name, value in result.get("fixed", {}).items():
-        shown, factor = display_unit(problem.parameter_units[name], value)
-        words = f"{number(factor * value)} {shown}".strip()
+        words = with_unit(value, problem.parameter_units[name], 5).strip()
         chosen = name in result.get("listed", {}).get("values", {})
         yield BeforeAfter(name, "from a list" if chosen else words, words, "")
     cost = hardware_cost(plant_of(problem), problem.start)  # of what a list holds now
@@ -188,19 +174,12 @@ def _as_started(run: FinishedRun) -> bool:
     """Whether no better hardware was found than that of the start."""
     pairs = zip(run.problem.start, run.theta, strict=True)
     listed = run.result.get("listed", {}).get("values", {})
-    return not listed and all(_change(*pair) in ("", "unchanged") for pair in pairs)
+    return not listed and all(abs(end - begin) < 5e-4 * abs(begin) for begin, end in pairs)
 
 
 def _resonances(problem: CoDesignProblem, theta: tuple[float, ...]) -> list[float]:
     modal = free_modal(problem, mechanics(plant_of(problem), theta, derivatives=False))
     return [float(hz) for hz in sorted(modal.natural[~modal.rigid & ~modal.driven_away] / HZ)]
-
-
-def _change(before: float | None, after: float) -> str:
-    if before is None or before == 0.0:
-        return ""
-    percent = 100.0 * (after / before - 1.0)
-    return "unchanged" if abs(percent) < 0.05 else f"{percent:+.1f} %"
 
 
 def bars(result: Mapping[str, Any]) -> Iterator[Bar]:

@@ -57,48 +57,17 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 
 @dataclass(frozen=True)
 class ConcernOptions:
-    """Usual limits of a loop beside those of `USUAL`.
+    """Usual limits of a loop beside those of `USUAL`."""
 
-    Attributes
-    ----------
-    slack : float
-        Relative: a design lies on its bounds, and 2 is the usual S_max.
-    overshoot : float
-        Of a step without feedforward.
-    between_lines : float
-        What |S| may reach between the lines of a response, over the largest on them.
-    """
-
-    slack: float = 0.01
-    overshoot: float = 0.5
-    between_lines: float = 1.1
-
-
-@dataclass(frozen=True)
-class ConditionOptions:
-    """Numbers of the conditions.
-
-    Attributes
-    ----------
-    identified : float
-        Relative: how well resonances are known where nothing else is stated.
-    """
-
-    identified: float = 0.05
+    slack: float = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
+    overshoot: float = 0.5  # of a step without feedforward
+    between_lines: float = 1.1  # what |S| may reach between lines, over the largest on them
+    identified: float = 0.05  # relative: how well resonances are known where nothing else is stated
 
 
 def limited_move(result: Mapping[str, Any]) -> str:
-    """Why the simulated move of `deploy --saturation` speaks against the design.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-
-    Returns
-    -------
-    str
-        Words; empty where the move settles, and where no limit was given.
+    """Why the simulated move of `deploy --saturation` speaks against the design; empty where it
+    settles.
     """
     move = _move(result)
     limit = spoken(f"{move.get('force_limit', 0.0):.4g} N")
@@ -123,20 +92,10 @@ def _move(result: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def resonance_condition(
-    result: Mapping[str, Any], *, options: ConditionOptions = ConditionOptions()
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> str:
-    """How well the resonances have to be known, where no set of the case holds such an error.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    options : ConditionOptions
-
-    Returns
-    -------
-    str
-        A sentence; empty where the loop has room, or the case names an error that it holds.
+    """How well the resonances have to be known, where no set of the case holds such an error; empty
+    where the loop has room.
     """
     line = result.get("verdict", {}).get("survives", {})
     kept, held = line.get("S_max_shift"), line.get("set_shift")
@@ -270,19 +229,8 @@ def percent_words(share: float, digits: int) -> str:
 
 
 def what_if(result: Mapping[str, Any], shift: float, gain: float) -> Iterator[tuple[str, str]]:
-    """What becomes of the loop where the machine differs from its model.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    shift, gain : float
-        Of all resonances, and of the whole plant, relative.
-
-    Yields
-    ------
-    (str, str)
-        If, then.
+    """If and then: the loop where all resonances, or the plant's gain, are off their model by these
+    shares.
     """
     line = result.get("verdict", {}).get("survives", {})
     percent = f"{100.0 * shift:g} %"
@@ -318,19 +266,8 @@ def what_if(result: Mapping[str, Any], shift: float, gain: float) -> Iterator[tu
 def risks(
     result: Mapping[str, Any], *, identified: float = 0.1, least_shift: float = 0.005
 ) -> list[str]:
-    """What may go wrong, the most serious first; what has no check is among them.
-
-    Parameters
-    ----------
-    result : mapping
-        Of result.json.
-    identified, least_shift : float
-        Relative: resonances are known that well; and below which none is known.
-
-    Returns
-    -------
-    list of str
-        Sentences.
+    """What may go wrong, the most serious first; what has no check is among them. Resonances are
+    taken to be known to `identified`, and none better than to `least_shift`, relative.
     """
     found = [
         f"{line.name} {line.state}: {line.words}" for line in lines_of(result)

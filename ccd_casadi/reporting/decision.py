@@ -89,29 +89,14 @@ SENTENCES = {
 
 @dataclass(frozen=True)
 class Decision:
-    """Whether to build a design.
-
-    Attributes
-    ----------
-    build : Build
-    concerns : tuple of Concern
-        The first is the most important.
-    steps : tuple of str
-        What to do next.
-    beside : tuple of Concern
-        What else speaks against a design that must not be built.
-    unjudged : bool
-        Hold and delay are not judged yet.
-    condition : str
-        What must be known of the resonances, in a sentence; empty where nothing must.
-    """
+    """Whether to build a design."""
 
     build: Build
-    concerns: tuple[Concern, ...] = ()
-    steps: tuple[str, ...] = ()
-    beside: tuple[Concern, ...] = ()
-    unjudged: bool = False
-    condition: str = ""
+    concerns: tuple[Concern, ...] = ()  # the first is the most important
+    steps: tuple[str, ...] = ()  # what to do next
+    beside: tuple[Concern, ...] = ()  # what else speaks against a design that must not be built
+    unjudged: bool = False  # hold and delay are not judged yet
+    condition: str = ""  # what must be known of the resonances, in a sentence; empty: nothing
 
     @property
     def words(self) -> str:

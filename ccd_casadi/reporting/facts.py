@@ -66,9 +66,27 @@ def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
     return f"{number(result['hardware_cost'], digits)} {result.get('cost_unit', '')}".strip()
 
 
-def cost_axis(problem: CoDesignProblem) -> str:
-    """The hardware cost on an axis."""
-    return f"hardware cost f ({problem.cost_unit})" if problem.cost_unit else "hardware cost f"
+def cost_label(problem: CoDesignProblem, name: str = "hardware cost f") -> str:
+    """Name the hardware cost with its unit, on an axis or in the head of a table.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    name : str
+
+    Returns
+    -------
+    str
+    """
+    return f"{name} ({problem.cost_unit})" if problem.cost_unit else name
+
+
+def change_words(before: float | None, after: float | None, digits: int, none: str) -> str:
+    """By how many percent a figure changed; `none` where these are 0, empty where not known."""
+    if before is None or after is None or before == 0.0:
+        return ""
+    percent = 100.0 * (after / before - 1.0)
+    return none if abs(percent) < 0.5 * 10.0**-digits else f"{percent:+.{digits}f} %"
 
 
 def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
@@ -102,8 +120,7 @@ def theta_words(result: Mapping[str, Any]) -> str:
     units = result.get("units", {})
     words = []
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
-        unit, factor = display_unit(units.get(name, ""), value)
-        words.append(f"{name} = {number(factor * value)} {unit}".strip())
+        words.append(f"{name} = {with_unit(value, units.get(name, ''), 5)}".strip())
     for name, (low, high) in result.get("varies", {}).items():
         unit, factor = display_unit(units.get(name, ""), high)
         words.append(f"every {name} from {factor * low:.5g} to {factor * high:.5g} {unit}".strip())
@@ -172,20 +189,8 @@ def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def requirement_words(
     one: Mapping[str, Any], *, digits: int = 5, least: float = 1e-6
 ) -> tuple[str, str]:
-    """What is required and what is achieved, in the unit that an engineer would read it in.
-
-    Parameters
-    ----------
-    one : mapping
-        An entry of `requirements` in result.json.
-    digits : int
-        Significant ones.
-    least : float
-        A constraint on θ that misses 0 by less, the solver's rounding, is 0.
-
-    Returns
-    -------
-    required, achieved : str
+    """What is required and achieved of an entry of `requirements` in result.json, in the unit that
+    an engineer would read it in; a constraint on θ that misses 0 by less than `least` is 0.
     """
     required, achieved = one["required"], one["achieved"]
     units = {"compliance_max": spoken("m/N"), "bandwidth_least_hz": "Hz"}

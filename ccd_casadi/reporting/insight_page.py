@@ -13,7 +13,7 @@ from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.reporting.decision import decide
 from ccd_casadi.reporting.facts import (
-    cost_axis,
+    cost_label,
     cost_words,
     paragraph,
     paragraphs,
@@ -120,7 +120,7 @@ def front_figure(
         for i, name in enumerate(problem.names)
     )
     bottom = c.Panel(
-        cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05)
+        cost_label(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05)
     )
     title = f"Hardware cost against {v.words} as the weights of J change, and the hardware there"
     lines = c.Lines(((top,), (bottom,)), title, (3.3, 2.8))
@@ -178,7 +178,7 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
     head = (
-        f"f ({problem.cost_unit})" if problem.cost_unit else "f",
+        cost_label(problem, "f"),
         f"{v.symbol} ({spoken(v.unit)})",
         *heads,
         "what binds",
@@ -221,7 +221,7 @@ def table_responses(
         rows.append((step * item.objective, (name, shown_value, theta or still, *changes)))
     rows.sort(key=lambda row: -abs(row[0]))
     moving = "θ, ln ω_S and ln ω_T move by" if swept else "θ moves by"
-    cost = f"f by ({problem.cost_unit})" if problem.cost_unit else "f by"
+    cost = cost_label(problem, "f by")
     head = ("1 % more of", "its value", moving, "ω_b by (Hz)", cost, "J by", "change of J")
     return c.Bars(head, tuple(row for _, row in rows), tuple(length for length, _ in rows))
 

@@ -8,17 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import FormulationRound
-from ccd_casadi.drawing.content import (
-    Band,
-    Curve,
-    Figure,
-    Landscape,
-    Level,
-    Lines,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -40,7 +30,7 @@ LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 def history_blocks(
     iterates: Sequence[FormulationRound], problem: CoDesignProblem, result: Mapping[str, Any],
     theta: tuple[float, ...], tolerance: float, *, lifted: bool,
-) -> tuple[Words, Table]:  # fmt: skip
+) -> tuple[c.Words, c.Table]:  # fmt: skip
     """ω_b and J predicted and true, round by round, the verified design last, and the error."""
     predicted_hz, true_hz = result["surrogate_bandwidth_hz"], result["bandwidth_hz"]
     J = result["objective"]
@@ -59,7 +49,7 @@ def history_blocks(
     units = (f"{name} ({unit})" if unit else name for name, unit, _ in axes)
     head = ("round", *units, "ω_b predicted Hz", "ω_b true Hz", "J predicted", "J true", "error")
     names = [*(str(i + 1) for i in range(len(iterates))), "verified"]
-    table = Table(head, tuple(
+    table = c.Table(head, tuple(
         (name, *(v * axis[2] for v, axis in zip(item.theta, axes, strict=True)), *row[:-1],
          small_share(row[-1]) if np.isfinite(row[-1]) else "–")
         for name, item, row in zip(names, (*iterates, last), known, strict=True)
@@ -71,43 +61,43 @@ def history_blocks(
     first = int(met[0]) + 1 if met.size else 0
     lost = int(np.isnan(objective).sum())
     shown = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
-    return Words(paragraph("report.history", *shown)), table
+    return c.Words(paragraph("report.history", *shown)), table
 
 
-def trust_figure(qualities: Sequence[Quality]) -> Figure:
+def trust_figure(qualities: Sequence[Quality]) -> c.Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
     rows = tuple(tuple(map(panel, qualities)) for panel in (_predicted, _residuals))
     title = "samples predicted without themselves, and their standardised residuals"
     words = paragraph("report.trust", len(qualities[0].true))
-    return Figure(Lines(rows, title, (3.3, 2.6)), words)
+    return c.Figure(c.Lines(rows, title, (3.3, 2.6)), words)
 
 
-def _predicted(q: Quality) -> Panel:
+def _predicted(q: Quality) -> c.Panel:
     both = np.concatenate([q.true, q.predicted])
     margin = 0.04 * float(np.ptp(both)) or 1.0
     span = (float(both.min()) - margin, float(both.max()) + margin)
     ends = np.array(span)
     curves = (
-        Curve(ends, ends, "", GREY, "--", width=0.8),
-        Curve(q.true, q.predicted, "", BLUE, "", "o"),
+        c.Curve(ends, ends, "", GREY, "--", width=0.8),
+        c.Curve(q.true, q.predicted, "", BLUE, "", "o"),
     )
     unit = spoken(AXES[q.name])
-    return Panel(f"true ({unit})", f"predicted ({unit})", curves, x_range=span, y_range=span,
+    return c.Panel(f"true ({unit})", f"predicted ({unit})", curves, x_range=span, y_range=span,
                  title=WORDS[q.name])  # fmt: skip
 
 
-def _residuals(q: Quality) -> Panel:
+def _residuals(q: Quality) -> c.Panel:
     most = max(LEAST_BAND, 1.1 * float(np.abs(q.standardised).max()))
-    return Panel(
+    return c.Panel(
         f"true ({spoken(AXES[q.name])})",
         "residual / deviation (–)",
-        (Curve(q.true, q.standardised, "", BLUE, "", "o"),),
-        levels=tuple(Level(sign * TWO_SIDED_95, "95 % band") for sign in (1.0, -1.0)),
+        (c.Curve(q.true, q.standardised, "", BLUE, "", "o"),),
+        levels=tuple(c.Level(sign * TWO_SIDED_95, "95 % band") for sign in (1.0, -1.0)),
         y_range=(-most, most),
     )
 
 
-def table_trust(qualities: Sequence[Quality]) -> Table:
+def table_trust(qualities: Sequence[Quality]) -> c.Table:
     """Errors left out, calibration and support at the design, output by output."""
     head = (
         "output", "samples", "leave one out, rms", "largest", "Q²",
@@ -119,7 +109,7 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
          number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_are, q.at_design)
         for q in qualities
     )  # fmt: skip
-    return Table(head, rows)
+    return c.Table(head, rows)
 
 
 GRID = 25  # points per parameter of a landscape
@@ -192,7 +182,7 @@ def landscape_data(
     radius: float = 1.0,
     theta: Sequence[float] = (0.0, 0.0),
     axes: tuple[int, int] = (0, 1),
-) -> Landscape:
+) -> c.Landscape:
     """Collect the landscape over two parameters, the others as at θ.
 
     Parameters
@@ -233,7 +223,7 @@ def landscape_data(
     known = known_bandwidths(problem, process, truths)
     single = {s.theta for s in truths.designs} - set(known)
     i, j = axes
-    return Landscape(
+    return c.Landscape(
         names=(problem.names[i], problem.names[j]),
         units=(problem.units[i], problem.units[j]),
         first=first,
@@ -273,7 +263,7 @@ def known_bandwidths(
     return best
 
 
-def caption_landscape(land: Landscape, best_hz: float) -> str:
+def caption_landscape(land: c.Landscape, best_hz: float) -> str:
     """What the colours and the dots are, and what the field leaves out."""
     field = land.bandwidth_hz
     inside = np.isfinite(field) & ~land.outside
@@ -302,7 +292,7 @@ def caption_disagreement(process: GaussianProcess | None, truths: Truths) -> str
 def slices_figure(
     problem: CoDesignProblem, process: GaussianProcess | None, truths: Truths,
     theta: Sequence[float], best_hz: float, extra: str,
-) -> Figure | None:  # fmt: skip
+) -> c.Figure | None:  # fmt: skip
     """One small panel a parameter: prediction, its 95 % band, and the truths nearby.
 
     None where nothing is known. `extra` ends the caption.
@@ -317,7 +307,7 @@ def slices_figure(
         axis, ends = axis_label(name, unit), (factor * lower[k], factor * upper[k])
         near = (np.delete(away, k, axis=1) <= NEARBY).all(axis=1) & np.isfinite(values)
         dots = factor * places[near, k], values[near]
-        curves = [Curve(*dots, "truth nearby", GREEN, "", "o")] if near.any() else []
+        curves = [c.Curve(*dots, "truth nearby", GREEN, "", "o")] if near.any() else []
         bands = []
         seen.append(values[near])
         if process is not None:
@@ -325,12 +315,12 @@ def slices_figure(
             points[:, k] = np.linspace(lower[k], upper[k], SLICE)
             hz, deviation = (each / HZ for each in process.predict(points, return_std=True))
             x, half = factor * points[:, k], TWO_SIDED_95 * deviation
-            curves.insert(0, Curve(x, hz, "surrogate"))
-            bands = [Band(x, hz - half, hz + half, "95 % band")]
+            curves.insert(0, c.Curve(x, hz, "surrogate"))
+            bands = [c.Band(x, hz - half, hz + half, "95 % band")]
             spans[name] = float(np.ptp(hz)), float(half.max())
             seen.append(hz)
-        optimum = Level(factor * at[k], "" if k else "optimum", True, GREY)
-        panels.append(Panel(
+        optimum = c.Level(factor * at[k], "" if k else "optimum", True, GREY)
+        panels.append(c.Panel(
             axis, "largest bandwidth ω_b* (Hz)", tuple(curves), tuple(bands), levels=(optimum,),
             x_range=ends, legend=None if k else "best",
         ))  # fmt: skip
@@ -344,8 +334,8 @@ def slices_figure(
     full = [*same, *[None] * (-len(same) % per_row)]
     rows = tuple(tuple(full[i : i + per_row]) for i in range(0, len(full), per_row))
     heights = (3.2 if len(rows) == 1 else 2.5,) * len(rows)
-    lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
+    lines = c.Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
     most = max(spans.items(), key=lambda item: item[1][0], default=None)
     band = max((half for _, half in spans.values()), default=0.0)
     shown = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
-    return Figure(lines, paragraph("report.slices", *shown) + extra)
+    return c.Figure(lines, paragraph("report.slices", *shown) + extra)

@@ -7,17 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
-from ccd_casadi.drawing.content import (
-    Block,
-    Chapter,
-    Curve,
-    Figure,
-    Level,
-    Lines,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -40,7 +30,7 @@ if TYPE_CHECKING:
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
 
 
-def bandwidths_table(verified: "VerifiedStructured") -> Table:
+def bandwidths_table(verified: "VerifiedStructured") -> c.Table:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
@@ -57,7 +47,7 @@ def bandwidths_table(verified: "VerifiedStructured") -> Table:
         )  # fmt: skip
         rows.append(("the model", "continuous", found.bandwidth))
     head = ("-3 dB of S with this controller, on", "loop", "Hz")
-    return Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
+    return c.Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
 
 
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
@@ -86,7 +76,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     return [*over_theta, *over_kappa, *ends]
 
 
-def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[Block, ...]:
+def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[c.Block, ...]:
     """What bounds every controller at θ, and what the set, hold and delay cost this structure."""
     costs, gap = result["costs"], result["gap"] or {}
     sampled = structured_of(problem).sampling is not None
@@ -106,11 +96,11 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
     ]
     most = sorted(costs.get("tolerances_hz", {}).items(), key=lambda item: item[1])
     shown = [item for item in most[:MOST_TOLERANCES] if item[1] < -LEAST_HZ]
-    words = Words(paragraph("report.costs", shown))
-    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), words
+    words = c.Words(paragraph("report.costs", shown))
+    return c.Table(("", "designed for", "loop", "ω_b"), tuple(rows)), words
 
 
-def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
+def controller_blocks(result: Mapping[str, Any]) -> tuple[c.Words, c.Table]:
     """Write gain and sections of a controller in Hz and damping.
 
     Parameters
@@ -127,14 +117,14 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     deployable = result.get("verdict", {}).get("deployable", {})
     moved = sampled_words(found, deployable.get("rate_hz"))
     words = paragraph("report.sections", controller, gain_words(controller), moved)
-    return Words(words), structured_table(found)
+    return c.Words(words), structured_table(found)
 
 
-def structured_table(found: Sequence[SectionWords]) -> Table:
+def structured_table(found: Sequence[SectionWords]) -> c.Table:
     """Zeros and poles of a controller's sections."""
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
     rows = ((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in found)
-    return Table(head, tuple(rows))
+    return c.Table(head, tuple(rows))
 
 
 PARTS = ("|S|", "|KS|", "|T|")
@@ -146,7 +136,7 @@ def shares(loop: LoopView, hz: float) -> np.ndarray:
     return np.asarray(loop.gains[:, i] / loop.bounds[:, i])
 
 
-def table_limits(loop: LoopView) -> Table:
+def table_limits(loop: LoopView) -> c.Table:
     """Shares of γ where it matters: below, at and above the bandwidth, and at the peaks of S."""
     most = max((gain for _, gain in loop.peaks), default=0.0)
     places = [
@@ -162,7 +152,7 @@ def table_limits(loop: LoopView) -> Table:
         percent = (float(f"{100.0 * share:.3g}") for share in found)
         rows.append((name, hz, *percent, PARTS[int(found.argmax())]))
     heads = (f"{part}, % of its bound" for part in PARTS)
-    return Table(("where", "Hz", *heads, "closest"), tuple(rows))
+    return c.Table(("where", "Hz", *heads, "closest"), tuple(rows))
 
 
 def limit_sentences(loop: LoopView) -> list[str]:
@@ -183,9 +173,9 @@ def limit_sentences(loop: LoopView) -> list[str]:
     return paragraphs("report.limits", loop, held, top, near, controlled)
 
 
-def limit_blocks(loop: LoopView, *more: str) -> tuple[Block, ...]:
+def limit_blocks(loop: LoopView, *more: str) -> tuple[c.Block, ...]:
     """The sentences, `more` of them, and the table."""
-    return (*map(Words, (*limit_sentences(loop), *more)), table_limits(loop))
+    return (*map(c.Words, (*limit_sentences(loop), *more)), table_limits(loop))
 
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
@@ -194,18 +184,18 @@ DECADES = 3.5  # of the error's axis
 
 def budget_chapter(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """Nothing for a problem without a budget."""
     found = loop_budget(problem, theta, controller)
     if found is None:
         return []
     if found.model is None:
         words = "The loop with the model is not stable: it has no stationary error."
-        return [Chapter("Error budget", (Words(words),))]
-    return [Chapter("Error budget", (*_budget_table(found, found.model), _figure(found.model)))]
+        return [c.Chapter("Error budget", (c.Words(words),))]
+    return [c.Chapter("Error budget", (*_budget_table(found, found.model), _figure(found.model)))]
 
 
-def _budget_table(found: LoopBudget, model: "BudgetFigures") -> tuple[Words, Table]:
+def _budget_table(found: LoopBudget, model: "BudgetFigures") -> tuple[c.Words, c.Table]:
     windowed = model.window is not None
     unit, scale = display_unit(spoken("m"), model.error)
     head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
@@ -220,10 +210,10 @@ def _budget_table(found: LoopBudget, model: "BudgetFigures") -> tuple[Words, Tab
     moving = (scale * model.average, scale * model.deviation) if windowed else ()
     rows.append(("together", "", scale * model.error, 100.0, *moving, model.force))
     words = paragraph("report.budget_table", found, model)
-    return Words(words), Table(tuple(head), tuple(rows))
+    return c.Words(words), c.Table(tuple(head), tuple(rows))
 
 
-def _figure(model: "BudgetFigures") -> Figure:
+def _figure(model: "BudgetFigures") -> c.Figure:
     shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
     hz = np.unique(np.concatenate([item.hz for item in shown]))
     parts = [np.interp(hz, item.hz, item.cumulative, left=0.0) for item in shown]
@@ -233,16 +223,16 @@ def _figure(model: "BudgetFigures") -> Figure:
     x = (low, max(2.0 * high, 10.0 * low))
     unit, scale = display_unit(spoken("m"), model.error)
     curves = [
-        Curve(hz, scale * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
+        c.Curve(hz, scale * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
               "-" if i < len(CYCLE) - 1 else "--")
         for i, (item, part) in enumerate(zip(shown, parts, strict=True))
     ]  # fmt: skip
-    total = Curve(hz, scale * np.sqrt(whole), "together", BLACK, width=1.8)
+    total = c.Curve(hz, scale * np.sqrt(whole), "together", BLACK, width=1.8)
     top = scale * float(np.sqrt(whole[-1]))
-    panel = Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
+    panel = c.Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
-    lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
-    return Figure(lines, paragraph("report.budget"))
+    lines = c.Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
+    return c.Figure(lines, paragraph("report.budget"))
 
 
 HEADING = "Start against optimum"
@@ -251,7 +241,7 @@ HEIGHTS = (3.0, 3.0)  # inches
 
 def start_chapter(
     problem: CoDesignProblem, verified: "VerifiedDesign", *, same: float = 1e-6
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """Both as figures, poles and a table; nothing where the run stayed within `same` (a share of
     the box) of its start.
 
@@ -263,20 +253,20 @@ def start_chapter(
     found = true_inner(problem, problem.start)
     if found.optimum is None:
         words = f"The hardware that the run began with has no feasible loop: {found.shortfall}."
-        return [Chapter(HEADING, (Words(words),))]
+        return [c.Chapter(HEADING, (c.Words(words),))]
     f = found.optimum.figures
     start = synthesised_loop(problem, problem.start, f.omega_S, f.omega_T, "start")
     loops = (start, replace(view_of(verified), label="optimum"))
     thetas = (problem.start, verified.theta)
     costs = [hardware_cost(plant_of(problem), theta) for theta in thetas]
     poles = [_roots(loop) for loop in loops]
-    lines = Lines(_panels(loops[::-1]), HEADING, HEIGHTS)
+    lines = c.Lines(_panels(loops[::-1]), HEADING, HEIGHTS)
     least = [float(damping.min()) for _, damping in poles]
     gained = 100.0 * (loops[1].bandwidth_hz / start.bandwidth_hz - 1.0)
     spared = 100.0 * (costs[1] / costs[0] - 1.0) if costs[0] else None
     words = paragraph("report.start", gained, spared, least)
     beside = _start_table(problem, thetas, loops, costs)
-    return [Chapter(HEADING, (Figure(lines, words), beside))]
+    return [c.Chapter(HEADING, (c.Figure(lines, words), beside))]
 
 
 def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:
@@ -284,14 +274,14 @@ def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:
     return frequency_and_damping(loop.loop.poles / HZ)
 
 
-def _panels(loops: Sequence[LoopView]) -> tuple[tuple[Panel, ...], ...]:
+def _panels(loops: Sequence[LoopView]) -> tuple[tuple[c.Panel, ...], ...]:
     """S over the plants and the poles of the loops."""
     coloured = list(zip(loops, CYCLE, strict=False))
-    G = [Curve(v.hz, sigma_max(v.plant), v.label, colour) for v, colour in coloured]
-    poles = tuple(Curve(*_roots(v), v.label, colour, "", "x") for v, colour in coloured)
-    pole_map = Panel(
+    G = [c.Curve(v.hz, sigma_max(v.plant), v.label, colour) for v, colour in coloured]
+    poles = tuple(c.Curve(*_roots(v), v.label, colour, "", "x") for v, colour in coloured)
+    pole_map = c.Panel(
         "|pole| (Hz)", "damping ratio of the loop's poles (–)", poles, log_x=True, legend=None,
-        levels=(Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
+        levels=(c.Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
     )  # fmt: skip
     S = gain_panels(loops, bounds=False)[0]
     return (S,), (over_hz(spoken(f"{loops[0].named('G')} (m/N)"), G, loops[0].ends), pole_map)
@@ -300,7 +290,7 @@ def _panels(loops: Sequence[LoopView]) -> tuple[tuple[Panel, ...], ...]:
 def _start_table(
     problem: CoDesignProblem, thetas: Sequence[Sequence[float]], loops: Sequence[LoopView],
     costs: Sequence[float],
-) -> Table:  # fmt: skip
+) -> c.Table:  # fmt: skip
     hz = [loop.bandwidth_hz for loop in loops]
     J = [problem.w1 * f + problem.w2 * HZ * v for f, v in zip(costs, hz, strict=True)]
     first = [min(loop.resonances_hz, default=np.nan) for loop in loops]
@@ -312,4 +302,4 @@ def _start_table(
         ("hardware cost f", problem.cost_unit or "–", *costs), ("first resonance", "Hz", *first),
         ("bandwidth ω_b", "Hz", *hz), ("objective J", "–", *J),
     ]  # fmt: skip
-    return Table(("", "unit", "start", "optimum"), tuple(rows))
+    return c.Table(("", "unit", "start", "optimum"), tuple(rows))

@@ -6,20 +6,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.survival import STATED
-from ccd_casadi.drawing.content import (
-    Band,
-    Chapter,
-    Curve,
-    Facts,
-    Figure,
-    Heading,
-    Level,
-    Lines,
-    Page,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
@@ -36,7 +23,7 @@ SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 
 def robustness_page(
     run: FinishedRun, found: Study, seed: int, index: str = "", *, own: bool = True
-) -> Page:
+) -> c.Page:
     """Make robustness.html.
 
     Parameters
@@ -65,7 +52,7 @@ def robustness_page(
         "" if own else given,
     )  # fmt: skip
     chapters = (
-        Chapter("In short", tuple(map(Words, others))),
+        c.Chapter("In short", tuple(map(c.Words, others))),
         _margins(found),
         _gains(found),
         _perturbed(run, found),
@@ -73,7 +60,7 @@ def robustness_page(
         *_structured(found),
         *([_move(found)] if found.moves else []),
     )
-    return Page(head, chapters, index)
+    return c.Page(head, chapters, index)
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
@@ -130,7 +117,7 @@ def _place(omega: float) -> str:
     return f"at {number(omega / HZ, 4)} Hz"
 
 
-def _margins(found: Study) -> Chapter:
+def _margins(found: Study) -> c.Chapter:
     head = (
         "loop broken at", "gain up", "gain down", "phase °", "crossover Hz", "disk α", "at Hz",
         "disk gain", "disk phase °",
@@ -146,10 +133,10 @@ def _margins(found: Study) -> Chapter:
     ]
     for name, margin in (("outputs", found.margins.outputs), ("inputs", found.margins.inputs)):
         rows.append((f"all {name} at once", *([nothing] * 4), *disk(margin)))
-    return Chapter("Margins", (Table(head, tuple(rows)), *map(Words, _words("margins"))))
+    return c.Chapter("Margins", (c.Table(head, tuple(rows)), *map(c.Words, _words("margins"))))
 
 
-def _gains(found: Study) -> Chapter:
+def _gains(found: Study) -> c.Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
         (found.view.named(name),
@@ -157,14 +144,14 @@ def _gains(found: Study) -> Chapter:
          _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
-    drawn = Figure(figure_gains([found.view], compliance=True), paragraph("robustness.gains"))
-    rms = Facts(tuple(facts("noise", found.noise, found.demands)))
-    white = (Heading("White noise (one-sided density)"), rms)
-    body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
-    return Chapter("Disturbance and noise", body, folded=True)
+    drawn = c.Figure(figure_gains([found.view], compliance=True), paragraph("robustness.gains"))
+    rms = c.Facts(tuple(facts("noise", found.noise, found.demands)))
+    white = (c.Heading("White noise (one-sided density)"), rms)
+    body = (drawn, c.Facts(tuple(tops)), *white)  # at rest: in short
+    return c.Chapter("Disturbance and noise", body, folded=True)
 
 
-def _perturbed(run: FinishedRun, found: Study) -> Chapter:
+def _perturbed(run: FinishedRun, found: Study) -> c.Chapter:
     """Peak and bandwidth over the shift, and over the damping; one mode at a time."""
     S_max = run.problem.inner.S_max
     panels = []
@@ -178,45 +165,47 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
         bandwidth = np.array([item.bandwidth / HZ for item in judged])
         # the axis shows what matters about S_max; a loop near instability has any peak
         top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
-        limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
+        limit = (c.Level(S_max, f"S_max {S_max:g}", colour=GREY),)
         ends = (factor * float(x[0]), factor * float(x[-1]))
-        curve = Curve(factor * x, peak, marker=".")
+        curve = c.Curve(factor * x, peak, marker=".")
         span = (1.0, max(top, 1.1 * S_max))
         lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
-        faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
+        faster = c.Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
         required = _required(factor, own)
         panels.append((
-            Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=(*limit, *required),
+            c.Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=(*limit, *required),
                   x_range=ends, y_range=span),
-            Panel(label, "ω_b (Hz)", (faster,), levels=required, x_range=ends),
+            c.Panel(label, "ω_b (Hz)", (faster,), levels=required, x_range=ends),
         ))  # fmt: skip
-    lines = Lines(tuple(panels), "Peak of S and bandwidth off the model")
-    drawn = Figure(lines, paragraph("robustness.perturbed", SHOWN_PEAK))
+    lines = c.Lines(tuple(panels), "Peak of S and bandwidth off the model")
+    drawn = c.Figure(lines, paragraph("robustness.perturbed", SHOWN_PEAK))
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
     )  # fmt: skip
     head = ("mode Hz", "shift %", "stable", "ω_b Hz", "‖S‖∞")
-    modes = (Heading("One mode at a time"), Table(head, rows)) if rows else ()
-    return Chapter("Plants off the model", (drawn, *modes))
+    modes = (c.Heading("One mode at a time"), c.Table(head, rows)) if rows else ()
+    return c.Chapter("Plants off the model", (drawn, *modes))
 
 
-def _required(factor: float, own: tuple[float, float]) -> tuple[Level, ...]:
+def _required(factor: float, own: tuple[float, float]) -> tuple[c.Level, ...]:
     """Both ends of the case's [robust] set on an axis; nothing where it names none."""
     if own[0] == own[1]:
         return ()
     words = ("[robust] set from here", "")
-    return tuple(Level(factor * v, said, True, GREEN) for v, said in zip(own, words, strict=True))
+    return tuple(c.Level(factor * v, said, True, GREEN) for v, said in zip(own, words, strict=True))
 
 
-def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
+def _unstable(
+    x: Array, peak: Array, stable: Array, span: tuple[float, float]
+) -> tuple[c.Band, ...]:
     """The ends of a line on which the loop is lost, in grey."""
-    found: list[Band] = []
+    found: list[c.Band] = []
     for outer, edge in ((x[0], stable[0]), (x[-1], stable[1])):
         if outer != edge and np.isnan(peak).any():
             ends = np.array([outer, edge])
             label = "" if found else "unstable"
-            found.append(Band(ends, np.full(2, span[0]), np.full(2, span[1]), label, GREY))
+            found.append(c.Band(ends, np.full(2, span[0]), np.full(2, span[1]), label, GREY))
     return tuple(found)
 
 
@@ -227,7 +216,7 @@ def shown_peak(run: FinishedRun, found: Study) -> float:
     return float(min(1.02 * max(largest, S_max), SHOWN_PEAK * S_max))
 
 
-def _tolerances(run: FinishedRun, found: Study) -> Chapter:
+def _tolerances(run: FinishedRun, found: Study) -> c.Chapter:
     """Distributions of peak and bandwidth over the random plants; in the table of quantiles the
     unstable ones are infinite peaks."""
     hard, shown = found.tolerances, shown_peak(run, found)
@@ -236,48 +225,50 @@ def _tolerances(run: FinishedRun, found: Study) -> Chapter:
     bandwidth = np.sort([item.bandwidth / HZ for item in judged if item.stable])
     share = (np.arange(peak.size) + 1.0) / max(len(judged), 1)
     S_max = run.problem.inner.S_max
-    limit = (Level(S_max, "S_max", vertical=True), Level(1.0, "all"))
+    limit = (c.Level(S_max, "S_max", vertical=True), c.Level(1.0, "all"))
     panels = (
-        Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak, share),),
+        c.Panel("‖S‖∞ (–)", "share of the plants (–)", (c.Curve(peak, share),),
               levels=limit, x_range=(min(*peak, S_max, 1e9), shown),
               y_range=(0.0, 1.08)),
-        Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
+        c.Panel("ω_b (Hz)", "share of the plants (–)", (c.Curve(bandwidth, share, colour=ORANGE),),
               y_range=(0.0, 1.08)),
     )  # fmt: skip
     peaks = np.sort([item.peak for item in judged])
     bands = np.sort([item.bandwidth / HZ if item.stable else 0.0 for item in judged])
     shares = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
     at = [round(share * (len(judged) - 1)) for share in shares]
-    table = Table.of(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), shares, peaks[at], bands[at])
+    table = c.Table.of(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), shares, peaks[at], bands[at])
     theta = theta_words({
         "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
         "units": dict(zip(run.problem.names, run.problem.units, strict=True)),
     })  # fmt: skip
     caption, *worst = _words("tolerances", hard, shown, theta)
-    lines = Lines((panels,), "Peak and bandwidth of random hardware")
-    return Chapter("Hardware tolerances", (Figure(lines, caption, (table,)), *map(Words, worst)))
+    lines = c.Lines((panels,), "Peak and bandwidth of random hardware")
+    return c.Chapter(
+        "Hardware tolerances", (c.Figure(lines, caption, (table,)), *map(c.Words, worst))
+    )
 
 
-def _structured(found: Study) -> list[Chapter]:
+def _structured(found: Study) -> list[c.Chapter]:
     bound = found.structured
     if bound is None:
         return []
     # 1/μ is what is allowed of complex errors; the level is what is allowed of real ones
-    panel = Panel(
-        "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
+    panel = c.Panel(
+        "frequency (Hz)", "μ (–)", (c.Curve(bound.hz, bound.mu, "complex errors", BLUE),),
         levels=(
-            Level(1.0 / bound.stiffness, f"bound for real errors (from {bound.worst_hz:.4g} Hz)"),
+            c.Level(1.0 / bound.stiffness, f"bound for real errors (from {bound.worst_hz:.4g} Hz)"),
         ),
         log_x=True, log_y=True,
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
     )  # fmt: skip
-    lines = Lines(((panel,),), "Structured singular value")
-    drawn = Figure(lines, paragraph("robustness.structured", bound))
-    return [Chapter("Structured singular value", (drawn,), folded=True)]
+    lines = c.Lines(((panel,),), "Structured singular value")
+    drawn = c.Figure(lines, paragraph("robustness.structured", bound))
+    return [c.Chapter("Structured singular value", (drawn,), folded=True)]
 
 
-def _move(found: Study) -> Chapter:
+def _move(found: Study) -> c.Chapter:
     ways = {"with mass feedforward" if m.feedforward else "without feedforward": [m]
             for m in found.moves}  # fmt: skip
     drawn = ways_figure(ways, "The loop is simulated exactly.")
-    return Chapter("A move", (*map(Words, _words("move", found)), drawn), folded=True)
+    return c.Chapter("A move", (*map(c.Words, _words("move", found)), drawn), folded=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime
 from difflib import unified_diff
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import write_page
 from ccd_casadi.reporting.concerns import lines_of
 from ccd_casadi.reporting.decision import advice
-from ccd_casadi.reporting.facts import cost_words, requirement_words, run_name
+from ccd_casadi.reporting.facts import change_words, cost_words, requirement_words, run_name
 from ccd_casadi.reporting.gain_figures import gain_panels, run_view
 from ccd_casadi.support.text import display_unit, number, spoken
 
@@ -32,6 +33,7 @@ FIGURES = (  # key of result.json, its name, its unit
     ("settling_ms", "settling of a step", "ms"),
     ("compliance_max", "compliance", "m/N"),
 )
+_change = partial(change_words, digits=2, none="none")
 Row = tuple[str, str, str, str]  # what, the first run, the second, the change
 
 
@@ -123,13 +125,6 @@ def _row(
         for value in (first, second)
     )
     return (name, before, after, _change(first, second))
-
-
-def _change(first: float | None, second: float | None) -> str:
-    if first is None or second is None or first == 0.0:
-        return ""
-    percent = 100.0 * (second / first - 1.0)
-    return "none" if abs(percent) < 0.005 else f"{percent:+.2f} %"
 
 
 def _requirements(first: FinishedRun, second: FinishedRun, names: tuple[str, str]) -> c.Table:

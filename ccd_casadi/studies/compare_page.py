@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.reporting.concerns import lines_of, worst_state
 from ccd_casadi.reporting.decision import decide
-from ccd_casadi.reporting.facts import theta_axes
+from ccd_casadi.reporting.facts import cost_label, theta_axes
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from ccd_casadi.reporting.solve_page import stage_chapters
@@ -233,7 +233,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table,
     """All methods in one table, the paper's figures below them."""
     factors = {name: factor for name, _, factor in theta_axes(problem)}
     names = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
-    cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
+    cost = cost_label(problem, "cost f")
     head = (
         "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "global check",
         "s", "certified", "stable for resonances", "survives",

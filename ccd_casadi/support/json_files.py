@@ -20,22 +20,10 @@ from surrogates.files import write_whole
 
 
 def hdf5_variables(path: Path) -> dict[str, Any]:
-    """Read the variables of a MATLAB 7.3 file.
+    """Read the variables of a MATLAB 7.3 file as arrays: structs of shape (1, 1) with named fields,
+    one text, cells of objects, and sparse matrices as such.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    dict of str to array
-        Structs as arrays of shape (1, 1) with named fields, texts as arrays of one text, cells as
-        arrays of objects, sparse matrices as such.
-
-    Raises
-    ------
-    UserError
-        h5py is not installed, or the file cannot be read.
+    Raises UserError where h5py is not installed, or the file cannot be read.
     """
     h5py = require("h5py", "hdf5")
     try:

@@ -198,16 +198,7 @@ def _square(weight: "control.StateSpace", size: int, name: str) -> StateSpace:
 def weighted_plant(G: StateSpace, weights: Sequence[StateSpace | None]) -> StateSpace:
     """The general plant of mixed sensitivity, z = (W1 e, W2 u, W3 G u), y = e = r - G u.
 
-    Parameters
-    ----------
-    G : StateSpace
-    weights : sequence of StateSpace or None
-        W1, W2, W3.
-
-    Returns
-    -------
-    StateSpace
-        Inputs (r, u), outputs (z, y); states of G, then of the weights.
+    Inputs are (r, u), outputs (z, y); states those of G, then of the weights W1, W2, W3.
     """
     (p, m), n = G.D.shape, len(G.A)
     of = (  # what drives each weight: of the states of G, of r and of u

@@ -44,18 +44,7 @@ class HinfCertificate:
 
 
 def lower_transformation(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
-    """F_l(P, K), the closed loop from w to z.
-
-    Parameters
-    ----------
-    P, K : StateSpace
-    nmeas, ncon : int
-        Numbers of y and u, the last of P.
-
-    Returns
-    -------
-    StateSpace
-    """
+    """F_l(P, K), the closed loop from w to z; y and u are the last of P."""
     p1, m1 = P.D.shape[0] - nmeas, P.D.shape[1] - ncon
     B1, B2, C1, C2 = P.B[:, :m1], P.B[:, m1:], P.C[:p1], P.C[p1:]
     D11, D12, D21, D22 = P.D[:p1, :m1], P.D[:p1, m1:], P.D[p1:, :m1], P.D[p1:, m1:]
@@ -246,19 +235,7 @@ def least_level(gp: GeneralPlant, options: HinfOptions = HinfOptions()) -> tuple
 def riccati_pair(
     gp: GeneralPlant, gamma: float, options: HinfOptions = HinfOptions()
 ) -> tuple[Array, Array] | str:
-    """X and Y at a level, or in words which condition does not hold.
-
-    Parameters
-    ----------
-    gp : GeneralPlant
-    gamma : float
-    options : HinfOptions
-
-    Returns
-    -------
-    X, Y : array (n, n)
-        Or a str.
-    """
+    """X and Y (n, n) at a level, or in words which condition does not hold."""
     if gamma <= gp.least:
         return "the direct terms of w to z"
     B, C = np.hstack([gp.B1, gp.B2]), np.vstack([gp.C1, gp.C2])

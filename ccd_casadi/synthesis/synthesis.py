@@ -20,34 +20,18 @@ from ccd_casadi.synthesis.weights import Weights
 
 @dataclass(frozen=True)
 class CertificateOptions:
-    """Numbers of the certificate of a closed loop.
+    """Numbers of the certificate of a closed loop."""
 
-    Attributes
-    ----------
-    unbounded : float
-        A level of γ that no weighted loop reaches: the loop is measured, its norm not judged.
-    known : float
-        Relative error of γ_opt up to which it counts as found.
-    """
-
-    unbounded: float = 1e9
-    known: float = 0.01
+    unbounded: float = 1e9  # a level of γ that no weighted loop reaches: its norm is not judged
+    known: float = 0.01  # relative error of γ_opt up to which it counts as found
 
 
 @dataclass(frozen=True)
 class PoleOptions:
-    """Numbers that decide which poles no mixed sensitivity serves.
+    """Numbers that decide which poles no mixed sensitivity serves."""
 
-    Attributes
-    ----------
-    on_axis : float
-        Re p/|p| up to which a pole that is not stable is on the imaginary axis.
-    hidden : float
-        Share of the inputs' or outputs' size up to which an unstable mode is not driven, or seen.
-    """
-
-    on_axis: float = 1e-9
-    hidden: float = 1e-13
+    on_axis: float = 1e-9  # Re p/|p| up to which an unstable pole is on the imaginary axis
+    hidden: float = 1e-13  # share of inputs or outputs up to which an unstable mode is not seen
 
 
 class Outcome(StrEnum):

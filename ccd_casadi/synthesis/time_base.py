@@ -9,24 +9,12 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class TimeBaseOptions:
-    """Numbers by which a discrete A is known from its eigenvalues.
+    """Numbers by which a discrete A is known from its eigenvalues."""
 
-    Attributes
-    ----------
-    outside : float
-        What |λ| may exceed 1 by: rounding, and slow unstable poles.
-    near : float
-        |λ| from which an eigenvalue lies near the unit circle.
-    share : float
-        Of all eigenvalues, more than this near the circle with a positive real part.
-    least : int
-        States: one eigenvalue alone shows nothing.
-    """
-
-    outside: float = 1e-3
-    near: float = 0.8
-    share: float = 0.5
-    least: int = 2
+    outside: float = 1e-3  # what |λ| may exceed 1 by: rounding, and slow unstable poles
+    near: float = 0.8  # |λ| from which an eigenvalue lies near the unit circle
+    share: float = 0.5  # of all eigenvalues: more are near the circle with a positive real part
+    least: int = 2  # states: one eigenvalue alone shows nothing
 
 
 HINT = "the matrices appear discrete: all eigenvalues within the unit circle, most of them near 1"

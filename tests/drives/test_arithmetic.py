@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from oracles import drive_simulation as oracle
 
-from ccd_casadi.extensions.drives.arithmetic import (
+from ccd_casadi.extensions.drives.cascade import (
     ArithmeticOptions,
+    Cascade,
     Program,
     following_error,
     program_of,
 )
-from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.drive_data import Number, read_drive
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace as Plant

@@ -26,8 +26,7 @@ from ccd_casadi.extensions.drives.drive_design import (
     moved_by_forces,
     require_known,
 )
-from ccd_casadi.extensions.drives.proof import prove_cascade
-from ccd_casadi.extensions.drives.sampled_model import SampledModel
+from ccd_casadi.extensions.drives.proof import SampledModel, prove_cascade
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper

@@ -9,14 +9,15 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.drive import main
-from ccd_casadi.extensions.drives import drive_codesign
+from ccd_casadi.extensions.drives import drive_case
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
 from ccd_casadi.extensions.drives.cascade_search import Search
-from ccd_casadi.extensions.drives.drive_case import DriveProblem, drive_problem
-from ccd_casadi.extensions.drives.drive_codesign import (
+from ccd_casadi.extensions.drives.drive_case import (
     DriveAt,
     DriveCodesignOptions,
+    DriveProblem,
     codesign_drive,
+    drive_problem,
 )
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, first_points, plants_at
 from ccd_casadi.inner_problem.problem import plant_of
@@ -90,7 +91,7 @@ def test_a_start_that_breaks_a_constraint_is_no_answer(
     def designed(drive: DriveProblem, theta: tuple[float, ...], *rest: Any) -> DriveAt:
         return DriveAt(theta, theta[0], theta[0], SimpleNamespace(bandwidth=1.0), 1.0)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(drive_codesign, "_designed", designed)
+    monkeypatch.setattr(drive_case, "_designed", designed)
     if there_is:
         assert codesign_drive(drive)[1].theta[0] >= least - 1e-6
         return

@@ -42,7 +42,7 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.lti.loop import sampled, tustin
-from ccd_casadi.reporting.concerns import ConditionOptions
+from ccd_casadi.reporting.concerns import ConcernOptions
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.inner_samples import InnerSample
@@ -192,7 +192,7 @@ def test_resonances_that_the_set_does_not_shift_are_a_condition_of_the_decision(
     result = json.loads((folder / "run" / "result.json").read_text())
     line = result["verdict"]["survives"]
     assert line["set_shift"] == [0.0, 0.0]
-    near = min(abs(end) for end in line["S_max_shift"]) < ConditionOptions().identified
+    near = min(abs(end) for end in line["S_max_shift"]) < ConcernOptions().identified
     before, condition, _ = advice(result).partition(" Condition: ")
     assert before.startswith("Build this") or not condition
     assert bool(condition) == (near and before.startswith("Build this"))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.reporting.concerns import ConcernKind, ConditionOptions, resonance_condition, risks
+from ccd_casadi.reporting.concerns import ConcernKind, ConcernOptions, resonance_condition, risks
 from ccd_casadi.reporting.decision import NEXT, Build, advice, decide
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
@@ -128,7 +128,7 @@ def test_resonances_that_must_be_known_are_a_condition_unless_the_set_holds_thei
         "set": OwnSet.KEPT, "robust_set": True, "S_max_shift": [-low, high],
         "set_shift": [-held, held],
     }  # fmt: skip
-    words, known = advice(result), ConditionOptions().identified
+    words, known = advice(result), ConcernOptions().identified
     assert words.startswith("Build this.")  # what scripts compare with
     assert ("Condition: " in words) == (held == 0.0 and min(low, high) < known)
     for sentence in words.split(". "):

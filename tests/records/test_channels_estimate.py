@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 from ccd_casadi.extensions.records import main
-from ccd_casadi.extensions.records.channels_estimate import estimate_channels, read_channels
+from ccd_casadi.extensions.records.plant_estimate import estimate_channels, read_channels
 from ccd_casadi.extensions.records.time_series import SignalNames
 from ccd_casadi.plants.measured import read_frequency_response
 from ccd_casadi.support.errors import UserError

@@ -39,21 +39,11 @@ SolidDrawing = Callable[[Mapping[str, float]], tuple[Any, Mapping[str, Sequence[
 
 @dataclass(frozen=True)
 class MorphOptions:
-    """Numbers of the fit of a mesh.
+    """Numbers of the fit of a mesh."""
 
-    Attributes
-    ----------
-    unseen : int
-        θ beside those of the fit, at which its error is measured.
-    most_error : float
-        Largest error, as a share of the mesh size.
-    rounding : float
-        m: coefficients are rounded to multiples of it.
-    """
-
-    unseen: int = 5
-    most_error: float = 1e-3
-    rounding: float = 1e-12
+    unseen: int = 5  # θ beside those of the fit, at which its error is measured
+    most_error: float = 1e-3  # largest error, as a share of the mesh size
+    rounding: float = 1e-12  # m: coefficients are rounded to multiples of it
 
 
 @dataclass(frozen=True)

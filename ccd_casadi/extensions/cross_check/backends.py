@@ -39,18 +39,10 @@ BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs
 
 @dataclass(frozen=True)
 class BackendOptions:
-    """Relative tolerances in the comparison of back ends.
+    """Relative tolerances in the comparison of back ends."""
 
-    Attributes
-    ----------
-    agree : float
-        Distance from the least γ that counts as none: what an interior-point method reaches.
-    below : float
-        Distance below the lower bound from which a claim is wrong.
-    """
-
-    agree: float = 1e-3
-    below: float = 1e-6
+    agree: float = 1e-3  # distance from the least γ that counts as none: of interior-point methods
+    below: float = 1e-6  # distance below the lower bound from which a claim is wrong
 
 
 @dataclass(frozen=True)
@@ -152,28 +144,14 @@ TITLES = {RICCATI: "one Riccati (ours)", SLICOT: "SB10AD (slycot)"}
 
 @dataclass(frozen=True)
 class BackendResult:
-    """The claim of a back end, and its design, measured.
-
-    Attributes
-    ----------
-    backend : str
-    gamma_opt : float
-        As the back end claims it.
-    design : Design or None
-        None where it made none.
-    words : str
-        Why there is no design, or the result of the certificate.
-    seconds : float
-    holds : bool or None
-        Whether claim and design hold (`verdicts`); None where there is no claim.
-    """
+    """The claim of a back end, and its design, measured."""
 
     backend: str
-    gamma_opt: float
-    design: Design | None
-    words: str
+    gamma_opt: float  # as the back end claims it
+    design: Design | None  # None where it made none
+    words: str  # why there is no design, or the result of the certificate
     seconds: float
-    holds: bool | None = None
+    holds: bool | None = None  # claim and design hold (`verdicts`); None: no claim
 
     @property
     def certified(self) -> bool:
@@ -256,18 +234,8 @@ def verdicts(
         γ > (1 + agree) γ_least       certified, but above the least
         otherwise                     right
 
-    with γ_jω of the package's own design and γ_least the least certified γ that is not wrong.
-
-    Parameters
-    ----------
-    results : sequence of BackendResult
-        That of "riccati" among them.
-    options : BackendOptions
-
-    Returns
-    -------
-    list of BackendResult
-        With `holds` and `words`; those without a design as they are.
+    with γ_jω of the package's own design ("riccati") and γ_least the least certified γ that is not
+    wrong. Those without a design are returned as they are.
     """
     ours = next(item for item in results if item.backend == RICCATI)
     bound = math.nan if ours.design is None else ours.design.figures.gamma_lower_bound

@@ -1,25 +1,44 @@
-"""A drive's cascade as one controller of the position and the motor's sensor.
+"""A drive's cascade: one controller of the position and the motor's sensor, and its program.
 
     v = F_s(z) Kv e,   w = v - (1 - 1/z)/T y_m,   u = F_c(z) Kp (1 + T/Tn 1/(1 - 1/z)) w
 
 e = r - y_p is the error of the position's sensor, y_m the motor's: its velocity is the difference
 of its counts. F_s are filters of the velocity setpoint, F_c those of the current command. As
 K = [K_p, K_m] both sensors' gains are tied by the same PI and filters.
+
+Its difference equations as they run (`Program`), in Python and the same as C, take counts of the
+encoders and give the force. Of the setpoint r the velocity is added to what the position controller
+wants, and the acceleration times the mass to the PI's force:
+
+    v = F_s (Kv e + f (r_k - r_{k-1})/T),   u = F_c (PI(v - v_m) + m (r_k - 2r_{k-1} + r_{k-2})/T²)
+
+With f = 1 and m the rigid mass the error falls with the jerk no more: what the delays leave follows
+the fourth derivative. Gains and the PI compute in the drive's floating point; a fixed-point filter
+takes and gives integers of `grain` N, its exact sum of products shifted right by 30, towards minus
+infinity; the C does so in 64 bits by halves of the coefficients.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.extensions.drives.drive_data import FORMS, PLACES, Drive, Filter, Setting, Slot
+from ccd_casadi.extensions.drives.drive_data import (
+    FORMS,
+    PLACES,
+    Drive,
+    Filter,
+    Number,
+    Setting,
+    Slot,
+)
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, template
 
 Values = Sequence[float] | Array  # SI, in the order of the settings
 
@@ -226,3 +245,133 @@ def _second_order(b: Array, a: Array, T: float) -> StateSpace:
     return StateSpace(np.array([[-a[1], 1.0], [-a[2], 0.0]]),
                       np.array([[b[1] - a[1] * b[0]], [b[2] - a[2] * b[0]]]),
                       np.array([[1.0, 0.0]]), np.array([[b[0]]]), period=T)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ArithmeticOptions:
+    """What the drive's file does not say."""
+
+    grain: float = 2.0**-20  # N, of an integer of a fixed-point filter's signal
+    bits: int = 30  # of its coefficients' fraction
+    distance: float = 0.01  # m, of the move that is simulated
+    seconds: float = 0.2  # that it takes
+    rest: float = 0.1  # s of what follows
+
+
+@dataclass(frozen=True)
+class Program:
+    """Numbers of one cascade's program, in the order in which they are used."""
+
+    kind: Number
+    real: type  # the floating point
+    Kv: float  # 1/s
+    Kp: float  # N s/m
+    share: float  # T/Tn
+    rate: float  # 1/T
+    setpoint: tuple[tuple[Any, ...], ...]  # filters (b0, b1, b2, a1, a2); fixed point: int
+    current: tuple[tuple[Any, ...], ...]  # the same
+    options: ArithmeticOptions
+    slower: int = 1  # calls to one of the position loop
+    ahead: float = 0.0  # f
+    push: float = 0.0  # m/T, kg/s
+
+    def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
+        """Force at every instant, of the reference and both sensors in m as the drive has them."""
+        step = self.started()
+        return [step(*row) for row in zip(reference, position, motor, strict=True)]
+
+    def started(self) -> Callable[[float, float, float], Any]:
+        """The program at rest: the force of (r, y, m), call after call."""
+        real = self.real
+        states = {id(own): [0, 0, 0, 0] if self._fixed else [real(0)] * 4
+                  for own in (*self.setpoint, *self.current)}  # fmt: skip
+        last, before, speed, total, held, call = None, None, real(0), real(0), real(0), 0
+
+        def step(reference: float, position: float, motor: float) -> Any:
+            nonlocal last, before, speed, total, held, call
+            r, m = real(reference), real(motor)
+            last, before = m if last is None else last, r if before is None else before
+            if call % self.slower == 0:
+                held = real(self.Kv) * (r - real(position))
+            call += 1
+            fast = (r - before) * real(self.rate)
+            v = held + real(self.ahead) * fast
+            for own in self.setpoint:
+                v = self._filtered(own, states[id(own)], v)
+            w = v - (m - last) * real(self.rate)
+            total = total + real(self.share) * w
+            u = real(self.Kp) * (w + total) + real(self.push) * (fast - speed)
+            last, before, speed = m, r, fast
+            for own in self.current:
+                u = self._filtered(own, states[id(own)], u)
+            return u
+
+        return step
+
+    @property
+    def _fixed(self) -> bool:
+        return self.kind is Number.FIXED_30
+
+    def _filtered(self, own: tuple[Any, ...], state: list[Any], u: Any) -> Any:
+        """y_k of u_k; `state`: u and y of the two instants before."""
+        b0, b1, b2, a1, a2 = own
+        grain = self.options.grain
+        x = round(float(u) / grain) if self._fixed else u
+        y = b0 * x + b1 * state[0] + b2 * state[1] - a1 * state[2] - a2 * state[3]
+        if self._fixed:
+            y >>= self.options.bits
+        state[:] = [x, state[0], y, state[2]]
+        return self.real(y * grain) if self._fixed else y
+
+    def code(self, title: str) -> str:
+        """The same as one C99 file: `cascade_step(state, r, y, m)`."""
+        real = "float" if self.real is np.float32 else "double"
+
+        def value(x: Any) -> str:
+            return f"{float(x)!r}{'f' if real == 'float' else ''}"
+
+        filters = (*self.setpoint, *self.current)
+        gains = ("Kv", "Kp", "share", "rate", "ahead", "push")
+        return template("extensions/drives/templates/cascade.c").render(
+            title=title, slower=self.slower, real=real, number="int64_t" if self._fixed else real,
+            grain=repr(self.options.grain), half=self.options.bits // 2, count=len(filters),
+            rows=[[str(int(x)) if self._fixed else value(x) for x in row] for row in filters],
+            setpoint=len(self.setpoint), **{name: value(getattr(self, name)) for name in gains},
+        )  # fmt: skip
+
+
+def program_of(
+    cascade: Cascade, values: Array, ahead: tuple[float, float] = (0.0, 0.0),
+    options: ArithmeticOptions = ArithmeticOptions(),
+) -> Program:  # fmt: skip
+    """The program of a cascade with rounded values (SI); `ahead`: f, and m in kg."""
+    kind = cascade.drive.number
+    real = np.float32 if kind is Number.SINGLE else float
+
+    def held(c: float) -> Any:
+        return round(c * 2**options.bits) if kind is Number.FIXED_30 else real(c)
+
+    own = {place: tuple(tuple(map(held, (*b.tolist(), *a[1:].tolist()))) for b, a in each)
+           for place, each in cascade.coefficients(values).items()}  # fmt: skip
+    Kv, Kp, Tn = (float(value) for value in values[:3])
+    share, rate = float(real(cascade.period / Tn)), float(real(1.0 / cascade.period))
+    return Program(kind, real, float(real(Kv)), float(real(Kp)), share, rate,
+                   own["setpoint"], own["current"], options,
+                   cascade.slower, float(real(ahead[0])),
+                   float(real(ahead[1] / cascade.period)))  # fmt: skip
+
+
+def following_error(program: Program, plant: StateSpace, position: int, velocity: int) -> float:
+    """How far in m the position is behind its setpoint at most, in a simulated move.
+
+    The setpoint is the polynomial of seventh order from rest to rest; sensors are exact. `plant`:
+    from force to all sensors at the program's rate; `position`, `velocity`: their numbers.
+    """
+    o, step, x, worst = program.options, program.started(), np.zeros(len(plant.A)), 0.0
+    for k in range(round((o.seconds + o.rest) * program.rate)):
+        t = min(k / program.rate / o.seconds, 1.0)
+        r = o.distance * t**4 * (35.0 - 84.0 * t + 70.0 * t**2 - 20.0 * t**3)
+        y = plant.C @ x
+        worst = max(worst, abs(r - y[position]))
+        x = plant.A @ x + plant.B[:, 0] * float(step(r, y[position], y[velocity]))
+    return float(worst)

@@ -147,22 +147,12 @@ class Search(CascadeRows):
 
 @dataclass(frozen=True)
 class RoundingOptions:
-    """Numbers of the rounding.
+    """Numbers of the rounding."""
 
-    Attributes
-    ----------
-    steps : int
-        Of the other values, for each neighbour.
-    passes, hops : int, tuple of int
-        Over all values by these numbers of steps, at most.
-    fine : float
-        A step that is this small relative to its value is rounded without a search.
-    """
-
-    steps: int = 6
-    passes: int = 8
-    hops: tuple[int, ...] = (-3, -1, 1, 3)
-    fine: float = 1e-5
+    steps: int = 6  # of the other values, for each neighbour
+    passes: int = 8  # over all values, at most
+    hops: tuple[int, ...] = (-3, -1, 1, 3)  # steps at once
+    fine: float = 1e-5  # of a value: a step as small is rounded without a search
 
 
 def on_the_grid(

@@ -67,21 +67,12 @@ FORMS = {
 
 @dataclass(frozen=True)
 class Filter:
-    """One filter of a drive.
-
-    Attributes
-    ----------
-    form : Form
-    rule : Rule
-    number : Number
-    period : float
-        T, s.
-    """
+    """One filter of a drive."""
 
     form: Form
     rule: Rule
     number: Number
-    period: float
+    period: float  # T, s
     of_fixed: ClassVar[float] = 2.0**30  # that many steps in one
     largest_fixed: ClassVar[float] = 2.0  # 32 bits with a sign
 
@@ -152,30 +143,16 @@ class Filter:
 
 @dataclass(frozen=True)
 class Setting:
-    """A parameter as the drive has it.
+    """A parameter as the drive has it."""
 
-    Attributes
-    ----------
-    name, number, unit : str
-        In the drive's words; the number is empty where no stored manual has it.
-    per_si : float
-        Its value per SI (1/s, N s/m, s, Hz).
-    rotary : str
-        Its unit where a rotary motor counts (N m s/rad, kg m²): `behind_screw`.
-    step : float
-        Of its grid, in its unit.
-    least, most : float
-        In its unit.
-    """
-
-    name: str
-    step: float
-    least: float
-    most: float
-    unit: str = ""
-    number: str = ""
-    per_si: float = 1.0
-    rotary: str = ""
+    name: str  # in the drive's words
+    step: float  # of its grid, in its unit
+    least: float  # in its unit
+    most: float  # in its unit
+    unit: str = ""  # in the drive's words
+    number: str = ""  # empty where no stored manual has it
+    per_si: float = 1.0  # its value per SI (1/s, N s/m, s, Hz)
+    rotary: str = ""  # its unit where a rotary motor counts (N m s/rad, kg m²): `behind_screw`
 
     def rounded(self, value: float, by: int = 0) -> float:
         """The nearest grid value in SI, `by` steps beside it, within the limits."""
@@ -205,45 +182,24 @@ class Slot:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a drive accepts.
-
-    Attributes
-    ----------
-    title : str
-    loop : str
-        "cascade": P position over PI velocity.
-    rule, number : Rule, Number
-        Of its filters.
-    position, velocity, integral : Setting
-        Kv in 1/s, velocity gain in N s/m, integral action time in s.
-    slots : tuple of Slot
-        Filters, in the order in which they are used.
-    speed_feedforward, force_feedforward : Setting or None
-        Of the setpoint's velocity, 1 for all of it, and of its acceleration, kg.
-    current, current_integral : Setting or None
-        Gain of the current controller in V/A, and its integral time in s.
-    sources, chosen, unknown : tuple of str
-        What manuals say, what is this file's choice, and what no manual was found for.
-    travel : float or None
-        Of the axis by a turn of a rotary motor, m/rad.
-    """
+    """What a drive accepts."""
 
     title: str
-    loop: str
-    rule: Rule
-    number: Number
-    position: Setting
-    velocity: Setting
-    integral: Setting
-    slots: tuple[Slot, ...]
-    sources: tuple[str, ...]
-    chosen: tuple[str, ...]
-    unknown: tuple[str, ...]
-    speed_feedforward: Setting | None = None
-    force_feedforward: Setting | None = None
-    current: Setting | None = None
-    current_integral: Setting | None = None
-    travel: float | None = None
+    loop: str  # "cascade": P position over PI velocity
+    rule: Rule  # of its filters
+    number: Number  # of its filters
+    position: Setting  # Kv, 1/s
+    velocity: Setting  # gain, N s/m
+    integral: Setting  # action time, s
+    slots: tuple[Slot, ...]  # filters, in the order in which they are used
+    sources: tuple[str, ...]  # what manuals say
+    chosen: tuple[str, ...]  # what is this file's choice
+    unknown: tuple[str, ...]  # what no manual was found for
+    speed_feedforward: Setting | None = None  # of the setpoint's velocity, 1: all of it
+    force_feedforward: Setting | None = None  # of its acceleration, kg
+    current: Setting | None = None  # gain of the current controller, V/A
+    current_integral: Setting | None = None  # its integral time, s
+    travel: float | None = None  # of the axis by a turn of a rotary motor, m/rad
 
     def places(self, place: str) -> tuple[Slot, ...]:
         """Its filters at a place."""

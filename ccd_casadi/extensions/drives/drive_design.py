@@ -40,73 +40,33 @@ NO_CASCADE = (
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """Numbers of a drive's design.
+    """Numbers of a drive's design."""
 
-    Attributes
-    ----------
-    draws : int
-        Plants that are drawn for the judge in each round, besides the corners.
-    added : int
-        Of these the worst that a round adds to the search's plants, at most.
-    rounds : int
-        Of search and proof: a plant that the proof finds is added.
-    rise_points : int
-        Frequencies up to half the rate at which the filters' gain is checked.
-    lowered, lower : int, float
-        How often, and by which share, ω_b is lowered where the proof finds a slower plant.
-    search, rounding : SearchOptions, RoundingOptions
-    """
-
-    draws: int = 200
-    rounds: int = 3
-    added: int = 4
-    lowered: int = 10
-    lower: float = 1e-3
-    rise_points: int = 20_000
+    draws: int = 200  # plants that are drawn for the judge in each round, besides the corners
+    rounds: int = 3  # of search and proof: a plant that the proof finds is added
+    added: int = 4  # of the drawn ones, the worst that join the search's plants in a round at most
+    lowered: int = 10  # how often ω_b is lowered where the proof finds a slower plant
+    lower: float = 1e-3  # by which share
+    rise_points: int = 20_000  # frequencies to half the rate at which the filters' gain is checked
     search: SearchOptions = field(default_factory=SearchOptions)
     rounding: RoundingOptions = field(default_factory=RoundingOptions)
 
 
 @dataclass(frozen=True)
 class DriveDesign:
-    """A cascade with its rounded values, and what is known of it.
-
-    Attributes
-    ----------
-    cascade : Cascade
-    values : array (n,)
-        On the drive's grid, SI.
-    bandwidth : float
-        ω_b in rad/s, for which the proof is.
-    free : Candidate
-        Before rounding.
-    certificate : SetCertificate
-        Of the rounded controller, on corners, draws and what the proof found.
-    proof : Proof
-        Of the rounded controller.
-    worst : Excess
-        The worst of the judged plants.
-    drawn : Yield or None
-        Those that were drawn since the last change of the design; None where it is proven.
-    compliance : float or None
-        The largest |z/d| that the judge found, m/N, where that is bounded; it is not proven.
-    mass : float
-        kg that the force moves as a rigid body, at the position's sensor; 0: none.
-    between : BetweenSamples or None
-        S between the samples, where the position counts; None of two rates.
-    """
+    """A cascade with its rounded values, and what is known of it."""
 
     cascade: Cascade
-    values: Array
-    bandwidth: float
-    free: Candidate
-    certificate: SetCertificate
-    proof: Proof
-    worst: Excess
-    drawn: Yield | None = None
-    compliance: float | None = None
-    mass: float = 0.0
-    between: BetweenSamples | None = None
+    values: Array  # (n,) on the drive's grid, SI
+    bandwidth: float  # ω_b in rad/s, for which the proof is
+    free: Candidate  # before rounding
+    certificate: SetCertificate  # of the rounded controller, on corners, draws and the proof's
+    proof: Proof  # of the rounded controller
+    worst: Excess  # of the judged plants
+    drawn: Yield | None = None  # since the last change of the design; None where it is proven
+    compliance: float | None = None  # the largest |z/d| that the judge found, m/N; it is not proven
+    mass: float = 0.0  # kg that the force moves as a rigid body, at the position's sensor; 0: none
+    between: BetweenSamples | None = None  # S between the samples, where the position counts
 
     @property
     def feedforward(self) -> list[tuple[Setting, float]]:
@@ -148,28 +108,9 @@ def design_drive(
 ) -> DriveDesign:  # fmt: skip
     """Find the fastest rounded cascade.
 
-    Parameters
-    ----------
-    cascade, uncertain, bounds, sampling : Cascade, UncertainPlant, Bounds, Sampling
-    seed : int
-    workers : Pool, optional
-        For the judge.
-    progress : callable
-        Takes a line at each step.
-    options : DriveOptions
-    near : Candidate, optional
-        From which the search climbs, instead of many starts.
-    ported : UncertainPlant, optional
-        The same with its ports, where compliance_max bounds what a force moves.
-
-    Returns
-    -------
-    DriveDesign
-
-    Raises
-    ------
-    UserError
-        No start is stable within the drive's limits, or none meets the bounds.
+    `near` is where the search climbs from, instead of many starts; `ported` the same plants with
+    their ports, where compliance_max bounds what a force moves; the workers are the judge's. Raises
+    UserError where no start is stable within the drive's limits, or none meets the bounds.
     """
     require_known(cascade, bounds)
     if cascade.slower > 1:

@@ -24,8 +24,7 @@ from ccd_casadi.codesign.verdict import (
     between_finding,
     survives,
 )
-from ccd_casadi.extensions.drives.drive_case import DriveProblem
-from ccd_casadi.extensions.drives.drive_codesign import meets_constraints
+from ccd_casadi.extensions.drives.drive_case import DriveProblem, meets_constraints
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.two_rates import LiftedLoop, lift, place_name
 from ccd_casadi.fixed_structure.certificate import SetCertificate
@@ -39,16 +38,8 @@ from ccd_casadi.synthesis.closed_loop import classical_margins
 def verdict_entry(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     """Judge a design as `ccd solve` judges sections: it is verified where no line fails.
 
-    Parameters
-    ----------
-    problem : DriveProblem
-    design : DriveDesign
-
-    Returns
-    -------
-    dict
-        `status`, `reason`, `verdict`, `margins` of every place, and margins and steps as
-        result.json has them, of a stable loop.
+    Gives `status`, `reason`, `verdict`, `margins` of every place, and margins and steps as
+    result.json has them, of a stable loop.
     """
     own, stable = design.cascade, all(one.stable for one in design.certificate.plants)
     figures: dict[str, Any] = {}

@@ -55,25 +55,12 @@ class TwoRateOptions:
 
 @dataclass(frozen=True)
 class LiftedLoop:
-    """The loop of one plant over N instants.
+    """The loop of one plant over N instants."""
 
-    Attributes
-    ----------
-    step : array (n, n)
-        Φ.
-    places : dict of StateSpace
-        S by the number of the sensor, and of the actuator by None, N x N; of a position's sensor
-        beside others 1 x 1.
-    slower : int
-        N.
-    period : float
-        T of the velocity loop, s.
-    """
-
-    step: Array
-    places: dict[int | None, StateSpace]
-    slower: int
-    period: float
+    step: Array  # (n, n) Φ
+    places: dict[int | None, StateSpace]  # S, N x N, by sensor, of the actuator by None
+    slower: int  # N
+    period: float  # T of the velocity loop, s
 
     @property
     def poles(self) -> np.ndarray:

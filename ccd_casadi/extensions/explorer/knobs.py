@@ -117,22 +117,12 @@ class Problems:
 
 @dataclass(frozen=True)
 class NotchOptions:
-    """Ranges of the notch's sliders.
+    """Ranges of the notch's sliders."""
 
-    Attributes
-    ----------
-    deepest, none : float
-        Least gain at its frequency, and the gain from which on it is no notch.
-    damping : tuple of float
-        Least, first and largest damping ratio of its poles: half its width over its frequency.
-    beside : float
-        How far its flanks are looked at, in widths.
-    """
-
-    deepest: float = 0.01
-    none: float = 0.99
-    damping: tuple[float, float, float] = (0.02, 0.3, 2.0)
-    beside: float = 3.0
+    deepest: float = 0.01  # least gain at its frequency
+    none: float = 0.99  # gain from which on it is no notch
+    damping: tuple[float, float, float] = (0.02, 0.3, 2.0)  # least, first, largest: half its width
+    beside: float = 3.0  # how far its flanks are looked at, in widths
 
 
 @dataclass(frozen=True)
@@ -161,29 +151,14 @@ class Notch:
 
 @dataclass(frozen=True)
 class Notched:
-    """The loop that is drawn, with a notch: recomputed from controller and plant.
-
-    Attributes
-    ----------
-    notch : Notch
-    stable : bool
-        By the poles of the closed loop, hold and delay exact.
-    hz : (k,) array
-        The page's frequencies, and those around the notch, Hz.
-    open : (k, p, p) array
-        L.
-    gain : (k,) array
-        σ_max(S).
-    margins : ClassicalMargins
-        The least.
-    """
+    """The loop that is drawn, with a notch: recomputed from controller and plant."""
 
     notch: Notch
-    stable: bool
-    hz: Array
-    open: np.ndarray
-    gain: Array
-    margins: ClassicalMargins
+    stable: bool  # by the poles of the closed loop, hold and delay exact
+    hz: Array  # (k,) the page's frequencies, and those around the notch, Hz
+    open: np.ndarray  # (k, p, p) L
+    gain: Array  # (k,) σ_max(S)
+    margins: ClassicalMargins  # the least
 
     @property
     def bandwidth_hz(self) -> float:
@@ -226,19 +201,8 @@ class Notched:
 
 
 def notched(view: LoopView, notch: Notch, options: NotchOptions = NotchOptions()) -> Notched:
-    """Judge a loop with a notch behind its controller.
-
-    Parameters
-    ----------
-    view : LoopView
-        The loop without it, on the page's frequencies.
-    notch : Notch
-    options : NotchOptions
-        How far around it is looked.
-
-    Returns
-    -------
-    Notched
+    """Judge a loop with a notch behind its controller; `view`: without it, on the page's
+    frequencies.
     """
     loop = replace(view.loop, controller=notch.behind(view.loop.controller))
     reach = np.exp(options.beside * notch.damping * np.linspace(-1.0, 1.0, 41))

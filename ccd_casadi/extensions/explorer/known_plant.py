@@ -108,7 +108,7 @@ def _working(given: tuple[bool, Callable[[Any, Tell], Any], Any]) -> Any:
 class Background:
     """A process for what the user waits for, a thread for what makes dragging better.
 
-    `then`, `failed` and `told` are called in another thread.
+    `then`, `failed` and `heard` are called in another thread.
     """
 
     def __init__(self, user_code: bool = True) -> None:
@@ -118,7 +118,7 @@ class Background:
         self._closed = False
 
     def ask(self, work: Callable[[Any, Tell], Any], task: Any, heard: Tell = silent) -> Future:
-        """Do what the user waits for, one after the other; `told` hears how far the work is."""
+        """Do what the user waits for, one after the other; `heard` is given how far it is."""
 
         def answered() -> Any:
             process = self._process = self._process or WorkerProcess()

@@ -38,18 +38,10 @@ from surrogates.files import write_whole
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """Times that decide what a drag waits for.
+    """Times that decide what a drag waits for."""
 
-    Attributes
-    ----------
-    quick : float
-        Of a full search that a drag of S_max waits for, s.
-    slow : float
-        Of the plant at a θ from which on it is solved in the background, s.
-    """
-
-    quick: float = 0.4
-    slow: float = 0.1
+    quick: float = 0.4  # of a full search that a drag of S_max waits for, s
+    slow: float = 0.1  # of the plant at a θ from which on it is solved in the background, s
 
 
 class Session:

@@ -106,14 +106,7 @@ def in_ms(seconds: float) -> str:
 
 
 def write_code(folder: Path, answer: Mapping[str, Any]) -> None:
-    """Write feedforward.h and feedforward.c.
-
-    Parameters
-    ----------
-    folder : Path
-    answer : mapping
-        Of feedforward.json.
-    """
+    """Write feedforward.h and feedforward.c of the content of feedforward.json."""
     h, F = np.array(answer["shaper"]), np.array(answer["forces"])
     values = {
         "taps": len(h), "spacing": answer["spacing"], "m": F.shape[2], "h": literals(h, 4),
@@ -127,20 +120,8 @@ def write_code(folder: Path, answer: Mapping[str, Any]) -> None:
 def read_error(log: Path, period: float) -> Array:
     """The error of a move (N, q) from the columns `error`, or error1, error2, ..., of a CSV file.
 
-    Parameters
-    ----------
-    log : Path
-    period : float
-        From line to line, s; a column `time` has to agree.
-
-    Returns
-    -------
-    array (N, q)
-
-    Raises
-    ------
-    UserError
-        There is no such column, one has another unit or rate, or a value is not a number.
+    `period` is from line to line in s; a column `time` has to agree. Raises UserError where there
+    is no such column, one has another unit or rate, or a value is not a number.
     """
     if not log.exists():
         raise UserError(f"{log}: there is no such file; give the log of a move")
@@ -238,34 +219,14 @@ def improved(
 
 @dataclass(frozen=True)
 class FeedforwardPageOptions:
-    """Numbers of the page.
+    """Numbers of the page."""
 
-    Attributes
-    ----------
-    shown : int
-        Plants of which a curve is drawn.
-    least : float
-        Of the window: a smaller error is drawn there.
-    """
-
-    shown: int = 12
-    least: float = 1e-3
+    shown: int = 12  # plants of which a curve is drawn
+    least: float = 1e-3  # of the window: a smaller error is drawn there
 
 
 def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -> c.Page:
-    """Make report.html.
-
-    Parameters
-    ----------
-    run : FinishedRun
-    found : SetFeedforward
-    index : str
-        Address of the page that links all pages of the run.
-
-    Returns
-    -------
-    Page
-    """
+    """Make report.html; `index` is the address of the page that links all pages of the run."""
     good = found.kept == len(found.judged)
     drawn = f"{found.kept} of {len(found.judged)} plants drawn from the set settle in time"
     lead = (

@@ -30,67 +30,32 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class LeastTimeOptions:
-    """Numbers of the search for the least time.
+    """Numbers of the search for the least time."""
 
-    Attributes
-    ----------
-    margin : float
-        Share of the window that is kept free on the plants of the design.
-    largest : float
-        What a coefficient moves, over the move.
-    first : int
-        Rows of a plant that the first programme has, spread over all times.
-    added : int
-        Rows that enter at most after each programme.
-    rounds : int
-        Programmes at most for one time.
-    tight : float
-        Of the window, the force and the heat: a row that is violated by less is kept.
-    """
-
-    margin: float = 0.1
-    largest: float = 20.0
-    first: int = 20
-    added: int = 300
-    rounds: int = 40
-    tight: float = 1e-3
+    margin: float = 0.1  # share of the window that is kept free on the plants of the design
+    largest: float = 20.0  # what a coefficient moves, over the move
+    first: int = 20  # rows of a plant that the first programme has, spread over all times
+    added: int = 300  # rows that enter at most after each programme
+    rounds: int = 40  # programmes at most for one time
+    tight: float = 1e-3  # of window, force and heat: a row that is violated by less is kept
 
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """What the motors may do in a move.
+    """What the motors may do in a move."""
 
-    Attributes
-    ----------
-    peak : float
-        u_max of any motor, N.
-    heat : float
-        E, N² s.
-    """
-
-    peak: float
-    heat: float
+    peak: float  # u_max of any motor, N
+    heat: float  # E, N² s
 
 
 @dataclass(frozen=True)
 class LeastTime:
-    """What a search found.
+    """What a search found."""
 
-    Attributes
-    ----------
-    x : (c,) array
-        Coefficients, as of `shape`.
-    shape : Shape
-    time : float
-        From which on all plants of the design are within the window less its margin, s.
-    left : float
-        s(t): the largest error from then on, over the window.
-    """
-
-    x: Array
+    x: Array  # (c,) coefficients, as of `shape`
     shape: Shape
-    time: float
-    left: float
+    time: float  # from which on all plants of the design are within the window less its margin, s
+    left: float  # s(t): the largest error from then on, over the window
 
 
 class _Programme:
@@ -172,25 +137,9 @@ def least_time(
 ) -> LeastTime | None:
     """Find the coefficients with which the latest plant settles at the earliest.
 
-    Parameters
-    ----------
-    plants : sequence of MoveResponses
-        Of one tap.
-    shape : Shape
-        Of the coefficients.
-    window : float
-        w, unit of y.
-    limits : ForceLimits
-    latest : float
-        A time that is known to be late enough, or where the search ends, s.
-    start : (c,) array
-        Coefficients whose largest errors are the first rows.
-    options : LeastTimeOptions
-
-    Returns
-    -------
-    LeastTime or None
-        None: not even by `latest`.
+    Plants are of one tap, `window` is w in the unit of y. `latest` is a time in s that is known to
+    be late enough, or where the search ends; `start` (c,) are coefficients whose largest errors are
+    the first rows. None: not even by `latest`.
     """
     shaped, period = [one.shaped(shape) for one in plants], plants[0].period
     move = float(np.abs(plants[0].end).max())

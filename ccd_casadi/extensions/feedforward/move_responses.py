@@ -37,24 +37,12 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class Shape:
-    """Which coefficients there are.
+    """Which coefficients there are."""
 
-    Attributes
-    ----------
-    orders : tuple of int
-        Derivatives of the setpoint that have a force.
-    forces : int
-        m, of the plant.
-    taps : int
-        Of every signal, the first without delay.
-    spacing : int
-        d, samples from tap to tap.
-    """
-
-    orders: tuple[int, ...]
-    forces: int
-    taps: int = 1
-    spacing: int = 1
+    orders: tuple[int, ...]  # derivatives of the setpoint that have a force
+    forces: int  # m, of the plant
+    taps: int = 1  # of every signal, the first without delay
+    spacing: int = 1  # d, samples from tap to tap
 
     @property
     def count(self) -> int:
@@ -82,24 +70,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class MoveResponses:
-    """One plant's move, by coefficients of one tap.
+    """One plant's move, by coefficients of one tap."""
 
-    Attributes
-    ----------
-    period : float
-        T, s.
-    reached : (N, q, c) array
-        What counts, per coefficient, unit of y; the first is of the setpoint itself.
-    force : (N, m, c) array
-        N.
-    setpoint : (N, q) array
-        What is wanted of that without a shaper; the last is where the move ends.
-    """
-
-    period: float
-    reached: Array
-    force: Array
-    setpoint: Array
+    period: float  # T, s
+    reached: Array  # (N, q, c) what counts, per coefficient, unit of y; the setpoint's first
+    force: Array  # (N, m, c) N
+    setpoint: Array  # (N, q) wanted of it without a shaper; the last is where the move ends
 
     @property
     def end(self) -> Array:
@@ -153,27 +129,11 @@ def _later(signal: Array, samples: int) -> Array:
 def responses_of(
     loop: Loop, profile: Setpoint, orders: tuple[int, ...], *, axis: int, samples: int
 ) -> MoveResponses:
-    """Respond to a setpoint and to a force of each of its derivatives at each motor.
+    """Respond with N samples to a setpoint and to a force of each of its derivatives at each motor.
 
-    Parameters
-    ----------
-    loop : Loop
-        Closed, sampled, SI.
-    profile : Setpoint
-        Of the output `axis`; the others stay at 0.
-    orders : tuple of int
-        Derivatives that have a force.
-    axis, samples : int
-        From 0; N.
-
-    Returns
-    -------
-    MoveResponses
-
-    Raises
-    ------
-    UserError
-        The loop is continuous, or not stable.
+    `loop` is closed, sampled and in SI, `profile` of the output `axis` (from 0); the others stay at
+    0. `orders` are the derivatives that have a force. Raises UserError where the loop is
+    continuous, or not stable.
     """
     if loop.sampling is None:
         raise UserError("feedforward: needs a sampled loop; deploy it, and give --controller")
@@ -204,18 +164,8 @@ def responses_of(
 
 
 def learning_gain(model: MoveResponses, shape: Shape) -> Array:
-    """Ψ⁺, from the error of a move to what is added to the forces of the coefficients.
-
-    Parameters
-    ----------
-    model : MoveResponses
-        Of the model, with all taps.
-    shape : Shape
-
-    Returns
-    -------
-    (c, N q) array
-        For the forces of the first tap.
+    """Ψ⁺ (c, N q), from the error of a move to what is added to the forces of the first tap;
+    `model` has all taps.
     """
     psi = _first(model, shape)
     size = np.abs(psi).max(axis=0)  # derivatives of the setpoint differ by many decades
@@ -230,18 +180,8 @@ def learned(x: Array, error: Array, gain: Array, shape: Shape) -> Array:
 
 
 def contraction(plants: Sequence[MoveResponses], gain: Array, shape: Shape) -> float:
-    """ρ, the largest of all plants: less than 1 where learning converges on each.
-
-    Parameters
-    ----------
-    plants : sequence of MoveResponses
-        With all taps.
-    gain : (c, N q) array
-    shape : Shape
-
-    Returns
-    -------
-    float
+    """ρ, the largest of all plants: less than 1 where learning converges on each; all taps, `gain`
+    (c, N q).
     """
     one = np.eye(len(gain))
     return max(float(np.abs(np.linalg.eigvals(one - gain @ _first(plant, shape))).max())

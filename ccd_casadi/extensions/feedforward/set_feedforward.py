@@ -40,74 +40,35 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class FeedforwardSetOptions:
-    """Numbers of the design for a set.
+    """Numbers of the design for a set."""
 
-    Attributes
-    ----------
-    drawn, added, rounds : int
-        Plants that are drawn after a design, those of them that join it at most, and how often.
-    judges : int
-        Plants that judge the last design.
-    tail : float
-        What is simulated after the setpoint, over its duration, doubled until the model's inverse
-        has settled on every plant.
-    doublings : int
-        At most.
-    spreads : tuple of float
-        Delays of the last tap that are tried, in periods of the lowest flexible mode.
-    worth : float
-        More taps have to settle earlier by this share.
-    """
-
-    drawn: int = 200
-    added: int = 5
-    rounds: int = 4
-    judges: int = 500
-    tail: float = 3.0
-    doublings: int = 4
-    spreads: tuple[float, ...] = (0.5, 1.0)
-    worth: float = 0.05
+    drawn: int = 200  # plants that are drawn after a design
+    added: int = 5  # those of them that join it at most
+    rounds: int = 4  # how often
+    judges: int = 500  # plants that judge the last design
+    tail: float = 3.0  # what is simulated after the setpoint, over its duration
+    doublings: int = 4  # of the tail at most, until the model's inverse has settled on every plant
+    spreads: tuple[float, ...] = (0.5, 1.0)  # delays of the last tap, in periods of the lowest mode
+    worth: float = 0.05  # more taps have to settle earlier by this share
 
 
 @dataclass(frozen=True)
 class SetFeedforward:
-    """A feedforward and what it does.
-
-    Attributes
-    ----------
-    found : LeastTime
-    inverse : (c,) array
-        The model's inverse as coefficients of one tap.
-    profile : Setpoint
-    window : float
-        Unit of y.
-    responses : tuple of MoveResponses
-        Of the plants of the design, the model's first; of one tap.
-    settled, settled_inverse : (plants,) array
-        When each has settled, s: with what was found and with the inverse.
-    judged, judged_inverse : (draws,) array
-        Of the plants that judge; empty where the run has no box to draw from.
-    limits : ForceLimits
-        What the inverse needs.
-    heat, peak : float
-        The largest of all plants, those that judge too, N² s and N.
-    contraction : float
-        ρ of `move_responses`, of the design's plants.
-    """
+    """A feedforward and what it does."""
 
     found: LeastTime
-    inverse: Array
+    inverse: Array  # (c,) the model's inverse as coefficients of one tap
     profile: Setpoint
-    window: float
-    responses: tuple[MoveResponses, ...]
-    settled: Array
-    settled_inverse: Array
-    judged: Array
-    judged_inverse: Array
-    limits: ForceLimits
-    heat: float
-    peak: float
-    contraction: float
+    window: float  # unit of y
+    responses: tuple[MoveResponses, ...]  # of one tap, of the design's plants, the model's first
+    settled: Array  # (plants,) when each has settled, s
+    settled_inverse: Array  # the same with the inverse
+    judged: Array  # (draws,) of the plants that judge; empty where the run has no box to draw from
+    judged_inverse: Array  # the same with the inverse
+    limits: ForceLimits  # what the inverse needs
+    heat: float  # N² s, the largest of all plants, those that judge too
+    peak: float  # N, the same
+    contraction: float  # ρ of `move_responses`, of the design's plants
 
     @property
     def latest(self) -> float:
@@ -137,26 +98,9 @@ def set_feedforward(
 ) -> SetFeedforward:
     """Find the feedforward, and at most `taps` taps of the shaper, for the set of a run.
 
-    Parameters
-    ----------
-    run : FinishedRun
-        With a sampled loop.
-    profile : Setpoint
-        Of the output `axis`, from 0.
-    window : float
-        In which the move has settled, unit of y.
-    axis, taps, seed : int
-        Of the plants that are drawn.
-    options : FeedforwardSetOptions
-
-    Returns
-    -------
-    SetFeedforward
-
-    Raises
-    ------
-    UserError
-        The loop is continuous, or no coefficients settle on all plants.
+    `profile` is of the output `axis` (from 0), `window` that in which the move has settled, in the
+    unit of y; `seed` is of the plants that are drawn. Raises UserError where the loop is
+    continuous, or no coefficients settle on all plants.
     """
     model, orders, inverse = _inverse(run, axis)
     plants = [model, *(member.plant.plant_si() for member in members(run, dense=True))]

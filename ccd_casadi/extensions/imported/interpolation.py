@@ -28,21 +28,11 @@ ANY: Errors = (np.inf, np.inf)
 
 @dataclass(frozen=True)
 class InterpolationOptions:
-    """Numbers of the interpolation between samples.
+    """Numbers of the interpolation between samples."""
 
-    Attributes
-    ----------
-    same : float
-        Share of the range below which a distance to a sample is zero.
-    damped : float
-        Responses are compared at s = (damped + j) ω, where moving resonances do not dominate.
-    frequencies : int
-        Number of these.
-    """
-
-    same: float = 1e-6
-    damped: float = 0.1
-    frequencies: int = 120
+    same: float = 1e-6  # share of the range below which a distance to a sample is zero
+    damped: float = 0.1  # compared at s = (damped + j) ω, where no moving resonance dominates
+    frequencies: int = 120  # number of these
 
 
 @dataclass(frozen=True)

@@ -23,24 +23,9 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     """Reduce the matrices of every sample in a folder to their lowest modes.
 
     With `static_correction` the responses (K + s M)⁻¹ [B, Cᵀ] join the modes as a Ritz basis, so
-    that the compliance at low frequency is that of the full model.
-
-    Parameters
-    ----------
-    folder : Path
-        With index.csv, dofs.csv and the matrices, SI.
-    modes : int
-        Number of modes kept.
-    static_correction : bool
-
-    Returns
-    -------
-    ModalTable
-
-    Raises
-    ------
-    PlantError
-        A file is missing, foreign, not symmetric or of another size than the others.
+    that the compliance at low frequency is that of the full model. The folder has index.csv,
+    dofs.csv and the matrices, in SI. Raises PlantError where a file is missing, foreign, not
+    symmetric or of another size than the others.
     """
     index = read_index(folder, "mass", "stiffness", "damping")
     dofs = read_dofs(folder, COLUMNS, RESULT_COLUMNS)
@@ -219,23 +204,7 @@ def read_dofs(folder: Path, *either: Sequence[str]) -> Rows:
 
 
 def read_index(folder: Path, *columns: str) -> Rows:
-    """Read the rows of index.csv.
-
-    Parameters
-    ----------
-    folder : Path
-    *columns : str
-        Columns that it must have.
-
-    Returns
-    -------
-    Rows
-
-    Raises
-    ------
-    PlantError
-        A column is missing.
-    """
+    """Read the rows of index.csv; PlantError where one of the columns is missing."""
     path = folder / "index.csv"
     found = read_rows(path)
     for key in columns:
@@ -245,21 +214,9 @@ def read_index(folder: Path, *columns: str) -> Rows:
 
 
 def results_table(folder: Path) -> ModalTable:
-    """Read the modal table of a folder of result files.
+    """Read the modal table of a folder with index.csv, dofs.csv and result files.
 
-    Parameters
-    ----------
-    folder : Path
-        With index.csv, dofs.csv and the result files.
-
-    Returns
-    -------
-    ModalTable
-
-    Raises
-    ------
-    PlantError
-        A file or node is missing, or a file holds no modes.
+    Raises PlantError where a file or node is missing, or a file holds no modes.
     """
     index, dofs = read_index(folder, "results", "damping"), read_dofs(folder, RESULT_COLUMNS)
     found = [read_modes(folder / row["results"]) for row in index.values()]

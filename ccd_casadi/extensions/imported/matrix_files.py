@@ -33,27 +33,12 @@ class MatrixFormat:
 def read_matrix(
     folder: Path, cell: str, role: str, *, symmetric: float = 1e-9
 ) -> tuple[csc_array, NodeRows | None]:
-    """Read a real symmetric matrix.
+    """Read a real symmetric matrix (n, n), and which (node, direction) is which row where that is
+    known.
 
-    Parameters
-    ----------
-    folder : Path
-    cell : str
-        The file in it, and after a colon which of its matrices.
-    role : str
-        "mass" or "stiffness".
-    symmetric : float
-        Asymmetry that rounding may have left, over the largest entry.
-
-    Returns
-    -------
-    csc_array (n, n)
-    mapping of (node, direction) to row, or None
-
-    Raises
-    ------
-    PlantError
-        The file cannot be read, or the matrix is not real, square and symmetric.
+    `cell` names the file, and after a colon which of its matrices; `role` is "mass" or "stiffness",
+    `symmetric` the asymmetry that rounding may have left, over the largest entry. Raises PlantError
+    where the file cannot be read, or the matrix is not real, square and symmetric.
     """
     file, _, name = cell.partition(":")
     path = folder / file

@@ -204,21 +204,11 @@ Groups = tuple[tuple[int, ...], ...]
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Numbers of the matching of modes.
+    """Numbers of the matching of modes."""
 
-    Attributes
-    ----------
-    close : float
-        Relative distance of frequencies within which modes are one group.
-    frequency_weight : float
-        Weight of |ln f_i/f_j| against 1 - MAC.
-    tie : float
-        Share of the shapes' size that keeps an undetermined rotation near the identity.
-    """
-
-    close: float = 0.15
-    frequency_weight: float = 1.0
-    tie: float = 1e-3
+    close: float = 0.15  # relative distance of frequencies within which modes are one group
+    frequency_weight: float = 1.0  # weight of |ln f_i/f_j| against 1 - MAC
+    tie: float = 1e-3  # share of the shapes' size that keeps an open rotation near the identity
 
 
 @dataclass(frozen=True)

@@ -44,21 +44,9 @@ class ResultFormat:
 
 
 def read_modes(path: Path) -> ResultModes:
-    """Read the modes in a result file.
+    """Read the modes in a result file, in order of frequency.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    ResultModes
-        In order of frequency.
-
-    Raises
-    ------
-    PlantError
-        It cannot be read, or holds no modes whose mass is known.
+    Raises PlantError where it cannot be read, or holds no modes whose mass is known.
     """
     form = RESULT_FORMATS.get(path.suffix.lower())
     if form is None:

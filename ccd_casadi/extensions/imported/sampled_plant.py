@@ -28,17 +28,10 @@ class AcceptanceOptions:
     """Largest relative errors of a sample that is predicted without it.
 
     A mode 5 % off moves a response at 10 % of damping by half.
-
-    Attributes
-    ----------
-    frequency_error : float
-        Of a frequency.
-    response_error : float
-        Of the response.
     """
 
-    frequency_error: float = 0.05
-    response_error: float = 0.5
+    frequency_error: float = 0.05  # of a frequency
+    response_error: float = 0.5  # of the response
 
 
 def modal_table(

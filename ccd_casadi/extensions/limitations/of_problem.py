@@ -36,28 +36,14 @@ MODEL = "the model"
 
 @dataclass(frozen=True)
 class BandwidthGap:
-    """Bounds on the bandwidth of every controller that keeps the bounds on the loop.
+    """Bounds on the bandwidth of every controller that keeps the bounds on the loop."""
 
-    Attributes
-    ----------
-    upper_bound : float
-        No controller on `plants` has this ω_b, rad/s; infinite: nothing bounds it.
-    lower_bound, model_bound : float
-        One on the model has the first, none the second, rad/s; 0: not computed.
-    channel : str
-        That binds.
-    plants : str
-        In words.
-    limits : tuple of str
-        What unstable poles and zeros of the model do to every loop, in words.
-    """
-
-    upper_bound: float
-    lower_bound: float = 0.0
-    channel: str = ""
-    plants: str = MODEL
-    model_bound: float = 0.0
-    limits: tuple[str, ...] = ()
+    upper_bound: float  # rad/s that no controller on `plants` has; infinite: nothing bounds it
+    lower_bound: float = 0.0  # rad/s that one on the model has; 0: not computed
+    channel: str = ""  # that binds
+    plants: str = MODEL  # in words
+    model_bound: float = 0.0  # rad/s that none on the model has; 0: not computed
+    limits: tuple[str, ...] = ()  # what unstable poles and zeros do to every loop, in words
 
     def finding(self, bandwidth: float) -> Finding:
         """Of the verdict, with a design's ω_b in rad/s."""
@@ -87,28 +73,11 @@ class BandwidthGap:
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> BandwidthGap:
-    """The bound on every controller at θ.
+    """The bound in rad/s on every controller at θ (SI), of a problem with a fixed structure.
 
-    On the model it holds for every set that has the model in it.
-
-    Parameters
-    ----------
-    problem : CoDesignProblem
-        With controllers of fixed structure.
-    theta : (n_θ,) sequence
-        SI.
-    within : bool
-        Whether to bound it on the model from both sides too, of one channel.
-
-    Returns
-    -------
-    BandwidthGap
-        rad/s.
-
-    Raises
-    ------
-    UserError
-        The problem is of another kind.
+    On the model it holds for every set that has the model in it; `within`: whether to bound it
+    there from both sides too, of one channel. Raises UserError where the problem is of another
+    kind.
     """
     loops = sorted(limits_of_problem(problem, theta), key=pointwise)
     if loops[0].name:

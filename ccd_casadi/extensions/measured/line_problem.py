@@ -37,19 +37,6 @@ from ccd_casadi.support.text import HZ
 
 
 @dataclass(frozen=True)
-class SpreadOptions:
-    """Numbers of the bound on all plants within a spread.
-
-    Attributes
-    ----------
-    least : float
-        ρ below which -ln ρ continues straight: a start may have plants that reach -1.
-    """
-
-    least: float = 0.05
-
-
-@dataclass(frozen=True)
 class LinePlants(PlantSet):
     """The lines as plants, each of one pole and its conjugate; `omega` (N,) over ω₀.
 
@@ -124,10 +111,11 @@ class LineProblem(LoopProblem):
             to_kappa[known] = (rate * share)[:, None] * slopes
         return value, to_kappa
 
-    def _lost(self, share: Array, options: SpreadOptions = SpreadOptions()) -> tuple[Array, Array]:
-        """-ln ρ with ρ = 1 - share, and its slope to the share."""
+    def _lost(self, share: Array, *, least: float = 0.05) -> tuple[Array, Array]:
+        """-ln ρ with ρ = 1 - share, and its slope to the share; straight for ρ below `least`, as a
+        start may have plants that reach -1."""
         room = 1.0 - share
-        held = np.maximum(room, options.least)
+        held = np.maximum(room, least)
         return -np.log(held) + (held - room) / held, 1.0 / held
 
     @cached_property

@@ -45,30 +45,17 @@ OF_DATA = (
 
 @dataclass(frozen=True)
 class MeasuredDesign:
-    """A controller found on measured lines; SI, frequencies in rad/s.
-
-    Attributes
-    ----------
-    structure, kappa, controller : Structure or ChannelStructure, array (n,), StateSpace or None
-        K(s), and κ of |K|.
-    bandwidth, figures : float, MeasuredFigures or None
-        The judge's.
-    usable, words : bool, str
-        Whether it is stable, surely so, and within every bound on every line; what is missing.
-    steps : int
-    sign : float
-        Of K: -1 where the plant of one channel has a negative gain.
-    """
+    """A controller found on measured lines; SI, frequencies in rad/s."""
 
     structure: Structure | ChannelStructure
-    kappa: Array
-    controller: StateSpace | None
-    bandwidth: float
-    figures: MeasuredFigures | None
-    usable: bool
-    words: str
+    kappa: Array  # (n,) of |K|
+    controller: StateSpace | None  # K(s)
+    bandwidth: float  # the judge's
+    figures: MeasuredFigures | None  # the judge's
+    usable: bool  # whether it is stable, surely so, and within every bound on every line
+    words: str  # what is missing
     steps: int
-    sign: float = 1.0
+    sign: float = 1.0  # of K: -1 where the plant of one channel has a negative gain
 
     def __repr__(self) -> str:
         order = "none" if self.controller is None else f"order {len(self.controller.A)}"

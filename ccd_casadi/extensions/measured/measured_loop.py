@@ -64,18 +64,8 @@ class MeasuredFigures(LoopPeaks):
 
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
-    """Evaluate a controller on lines.
-
-    Parameters
-    ----------
-    K, hz : StateSpace, array (k,)
-        Continuous; frequencies in Hz.
-    period : float, optional
-        s: K is discretised by Tustin's rule, without prewarping.
-
-    Returns
-    -------
-    array (k, m, p)
+    """Evaluate a continuous controller (k, m, p) on lines in Hz; with a period in s by Tustin's
+    rule, without prewarping.
     """
     runs = K if period is None else tustin(K, period)
     return runs.response(HZ * np.asarray(hz, float))
@@ -251,17 +241,8 @@ def _turns(measured: MeasuredResponse, F: np.ndarray) -> Array:
 def bandwidth_within(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
     """Find the largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape.
 
-    Parameters
-    ----------
-    omega, ln_S : array (k,)
-        rad/s; ln σ_max(S) there.
-    bounds, integrator : Bounds, bool
-        The shape counts from 0 on with an integrator, else from ω_low.
-
-    Returns
-    -------
-    float
-        rad/s; 0 where |S| > 1/√2 on the first line.
+    `omega` is in rad/s, `ln_S` ln σ_max(S) there. The shape counts from 0 on with an integrator,
+    else from ω_low. It is 0 where |S| > 1/√2 on the first line.
     """
     level = -HALF_POWER
     above = np.flatnonzero(ln_S > level)

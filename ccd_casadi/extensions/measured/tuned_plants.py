@@ -28,42 +28,19 @@ Plant = MeasuredResponse | StateSpace
 
 @dataclass(frozen=True)
 class LineOptions:
-    """Numbers of the lines on which a model is tuned.
+    """Numbers of the lines on which a model is tuned."""
 
-    Attributes
-    ----------
-    per_decade : int
-        Lines a decade, besides those around roots.
-    lowest, highest : float
-        First line over the slowest root, last line over half the rate.
-    on_axis : float
-        |Re p|/|p| up to which a pole has no damping.
-    half_width : float
-        Relative half width that such a pole is given for its lines.
-    hidden : float
-        Relative singular value below which a mode is not driven, or not measured.
-    apart : float
-        Least relative distance of two lines.
-    at_rest : float
-        Share of the largest root below which a root lies at 0.
-    most_samples : int
-        Samples of a delay at most.
-    nearby, halvings : float, int
-        Relative distance of the outermost line that is added beside a frequency, and how many lines
-        are added on each side, each at half the distance of the one before.
-    """
-
-    per_decade: int = 60
-    lowest: float = 3e-3
-    highest: float = 0.98
-    on_axis: float = 1e-8
-    half_width: float = 1e-3
-    hidden: float = 1e-12
-    apart: float = 1e-6
-    at_rest: float = 1e-7
-    most_samples: int = 1000
-    nearby: float = 0.02
-    halvings: int = 6
+    per_decade: int = 60  # lines, besides those around roots
+    lowest: float = 3e-3  # first line over the slowest root
+    highest: float = 0.98  # last line over half the rate
+    on_axis: float = 1e-8  # |Re p|/|p| up to which a pole has no damping
+    half_width: float = 1e-3  # relative, that such a pole is given for its lines
+    hidden: float = 1e-12  # relative singular value of a mode that is not driven, or not measured
+    apart: float = 1e-6  # least relative distance of two lines
+    at_rest: float = 1e-7  # share of the largest root below which a root lies at 0
+    most_samples: int = 1000  # of a delay
+    nearby: float = 0.02  # relative distance of the outermost line that is added beside a frequency
+    halvings: int = 6  # lines added on each side, each at half the distance of the one before
 
 
 def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
@@ -219,34 +196,13 @@ def with_lines_near(
 
 
 @dataclass(frozen=True)
-class PresentOptions:
-    """Numbers of the reading of a controller.
-
-    Attributes
-    ----------
-    at_rest : float
-        Size of a pole over the fastest below which it is an integrator.
-    """
-
-    at_rest: float = 1e-6
-
-
-@dataclass(frozen=True)
 class PresentLoop:
-    """The loop of the present controller, the worst of several responses.
+    """The loop of the present controller, the worst of several responses."""
 
-    Attributes
-    ----------
-    stable : bool
-        By the winding on the lines.
-    bandwidth_hz, peak, peak_hz : float
-        First -3 dB of S, the largest |S| on the lines and where; NaN where it is not stable.
-    """
-
-    stable: bool
-    bandwidth_hz: float
-    peak: float
-    peak_hz: float
+    stable: bool  # by the winding on the lines
+    bandwidth_hz: float  # first -3 dB of S; NaN where it is not stable, as the next two
+    peak: float  # the largest |S| on the lines
+    peak_hz: float  # where
 
     @property
     def words(self) -> str:
@@ -258,28 +214,13 @@ class PresentLoop:
 
 
 def present_loop(
-    path: Path, responses: Sequence[MeasuredResponse], bounds: Bounds, period: float | None,
-    options: PresentOptions = PresentOptions(),
-) -> PresentLoop:  # fmt: skip
+    path: Path, responses: Sequence[MeasuredResponse], bounds: Bounds, period: float | None
+) -> PresentLoop:
     """Judge the controller of a file on responses as they were measured, without their spread.
 
-    Parameters
-    ----------
-    path : Path
-        As `read_controller` takes it: state space (.json, .mat) or filters (.toml).
-    responses, bounds : sequence of MeasuredResponse, Bounds
-    period : float or None
-        s; a continuous controller runs by Tustin's rule.
-    options : PresentOptions
-
-    Returns
-    -------
-    PresentLoop
-
-    Raises
-    ------
-    UserError
-        The file holds no controller of these channels, or one of another rate.
+    The file is as `read_controller` takes it; with a period in s a continuous controller runs by
+    Tustin's rule. Raises UserError where it holds no controller of these channels, or one of
+    another rate.
     """
     K, _ = read_controller(path)
     outputs, inputs = responses[0].matrix.shape[1:]
@@ -291,14 +232,14 @@ def present_loop(
                         f"{1.0 / period:.6g} Hz; give the continuous one")  # fmt: skip
     plain = [replace(one, spread=None) for one in responses]
     found = judge(plain, K, replace(bounds, shape=None), period=None if K.period else period,
-                  integrator=_integrates(K, options))  # fmt: skip
+                  integrator=_integrates(K))  # fmt: skip
     peak_hz = found.S_peak_frequency / HZ
     return PresentLoop(found.stable, found.bandwidth / HZ, found.S_peak, peak_hz)
 
 
-def _integrates(K: StateSpace, options: PresentOptions) -> bool:
-    """Whether K has a pole at rest."""
+def _integrates(K: StateSpace, *, at_rest: float = 1e-6) -> bool:
+    """Whether K has a pole at rest: smaller than the fastest by the factor `at_rest`."""
     if not len(K.A):
         return False
     rates = np.abs(K.poles - 1.0) if K.period else np.abs(K.poles)
-    return bool(rates.min() <= options.at_rest * max(float(rates.max()), 1e-300))
+    return bool(rates.min() <= at_rest * max(float(rates.max()), 1e-300))

@@ -40,36 +40,16 @@ from ccd_casadi.support.worker_process import one_blas_thread
 
 @dataclass(frozen=True)
 class TuningOptions:
-    """Numbers of `tune`.
+    """Numbers of `tune`."""
 
-    Attributes
-    ----------
-    most_notches : int
-        Biquads where no structure is given.
-    inside : float
-        Share of S_max - 1 by which S_max is reduced on the lines of a model.
-    given_up : float
-        Share of the bandwidth that is given up for integral gain.
-    rounds : int
-        Rounds of adding lines where the loop on the model is worse than on the lines.
-    most_starts : int
-        Up to which the starts are doubled after a search that found no usable controller.
-    slower : float
-        Relative loss of bandwidth between the lines of a model from which lines are added.
-    per_decade : int
-        Frequencies a decade of a loop on a model.
-    about_crossing : int
-        Frequencies about its crossing.
-    """
-
-    most_notches: int = 3
-    inside: float = 2e-3
-    given_up: float = 0.03
-    rounds: int = 10
-    most_starts: int = 48
-    slower: float = 1e-3
-    per_decade: int = 200
-    about_crossing: int = 41
+    most_notches: int = 3  # biquads where no structure is given
+    inside: float = 2e-3  # share of S_max - 1 by which S_max is reduced on the lines of a model
+    given_up: float = 0.03  # share of the bandwidth that is given up for integral gain
+    rounds: int = 10  # of adding lines where the loop on the model is worse than on the lines
+    most_starts: int = 48  # up to which starts are doubled after a search without usable controller
+    slower: float = 1e-3  # loss of bandwidth between a model's lines from which lines are added
+    per_decade: int = 200  # frequencies of a loop on a model
+    about_crossing: int = 41  # frequencies about its crossing
 
 
 NOT_JUDGED = Judgement(0, {}, None, "no usable controller was found to judge")

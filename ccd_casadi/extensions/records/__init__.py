@@ -108,7 +108,7 @@ def _several(options: argparse.Namespace, names: "SignalNames", how: "EstimateOp
     """The same of several forces and positions, without a picture."""
     import numpy as np
 
-    from ccd_casadi.extensions.records.channels_estimate import (
+    from ccd_casadi.extensions.records.plant_estimate import (
         channel_findings,
         estimate_channels,
         read_channels,

@@ -60,51 +60,26 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class LocalFit:
-    """Responses of q signals to the excitation at some lines.
+    """Responses of q signals to the excitation at some lines."""
 
-    Attributes
-    ----------
-    G : array (k, q)
-    covariance : array (k, q, q)
-        E[e eᴴ] of the error e of G.
-    degrees : array (k,)
-        Degrees of freedom behind the covariance, complex.
-    coherence : array (k, q)
-        Share of a signal's power in the window that the excitation explains, beside T.
-    transient : array (k, q)
-        Share of a signal's power that T alone explains.
-    width : array (k,)
-        Lines of the window.
-    """
-
-    G: np.ndarray
-    covariance: np.ndarray
-    degrees: Array
-    coherence: Array
-    transient: Array
-    width: Array
+    G: np.ndarray  # (k, q)
+    covariance: np.ndarray  # (k, q, q) E[e eᴴ] of the error e of G
+    degrees: Array  # (k,) of freedom behind the covariance, complex
+    coherence: Array  # (k, q) share of a signal's power that the excitation explains, beside T
+    transient: Array  # (k, q) share of a signal's power that T alone explains
+    width: Array  # (k,) lines of the window
 
 
 def fit_locally(
     Z: np.ndarray, R: np.ndarray, lines: np.ndarray, period_lines: int = 1,
     options: WindowOptions = WindowOptions(),
 ) -> LocalFit:  # fmt: skip
-    """Fit local polynomials about lines of a transform.
+    """Fit local polynomials about some lines of a transform.
 
-    Parameters
-    ----------
-    Z, R : array (M, q, K), array (M, K)
-        Spectra of the signals and of the excitation in M records, line 0 first; G is one for all.
-    lines : int array (k,)
-        Where the responses are wanted.
-    period_lines : int
-        Number of whole periods in the record: only each such line is then excited, and the lines
-        between give T and the noise. 1: not periodic.
-    options : WindowOptions
-
-    Returns
-    -------
-    LocalFit
+    `Z` (M, q, K) and `R` (M, K) are spectra of the signals and of the excitation in M records, line
+    0 first; G is one for all. `period_lines` is the number of whole periods in the record: only
+    each such line is then excited, and the lines between give T and the noise; 1: it is not
+    periodic.
     """
     if period_lines > 1:
         return _periodic(Z, R, lines, period_lines, options)

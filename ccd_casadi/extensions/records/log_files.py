@@ -114,24 +114,10 @@ def is_scope(text: str) -> bool:
 
 
 def scope_columns(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Read the channels of the sampling time that most of them have.
+    """Read the channels of the sampling time that most of them have: "t (ms)" and the channels with
+    their units, as the scope has scaled them; and what is to be reported.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    text : str
-
-    Returns
-    -------
-    dict of str to array (n,), list of str
-        "t (ms)" and the channels with their units, as the scope has scaled them; what is to be
-        reported.
-
-    Raises
-    ------
-    UserError
-        The separator occurs inside cells, or a line is not numbers.
+    Raises UserError where the separator occurs inside cells, or a line is not numbers.
     """
     try:
         return _columns(path, [line.rstrip("\r") for line in text.splitlines()])

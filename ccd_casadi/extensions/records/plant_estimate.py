@@ -1,4 +1,4 @@
-"""The plant's response from a record of a loop: by the excitation as the instrument.
+"""The plant's response from records of a loop: by the excitation as the instrument.
 
 With the excitation r (a force that is injected, or the reference) as the instrument
 
@@ -13,16 +13,25 @@ differences: these do not change G, and make of a drift an offset and of a step 
 
 is the variance of Ĝ with ν degrees of freedom, and the radius of the disc about Ĝ that holds G with
 the stated probability, at each line alone.
+
+Of several forces and positions there is one record or more a force. In record i the excitation r_i
+drives all forces u and positions y of the loop. With the responses Y = [G_yr1 G_yr2 …] and
+U = [G_ur1 G_ur2 …] of all records, each with its covariance C_i,
+
+    G = Y U⁺,     var G_ab = Σ_i ([I -G] C_i [I -G]ᴴ)_aa |U⁺_ib|²,
+
+as for one channel; the spread is that of each entry.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ccd_casadi.extensions.records.local_polynomial import WindowOptions, fit_locally
-from ccd_casadi.extensions.records.time_series import TimeSeries
+from ccd_casadi.extensions.records.time_series import SignalNames, TimeSeries, read_record
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -56,6 +65,9 @@ class EstimateOptions:
         |G_ur| below which an injected force is not in the force.
     drift : float
         Offset between the ends of a record over the range of the position from which it is named.
+    alike : float
+        Of several channels: least singular value of U over the largest, below which two records
+        excite alike.
     """
 
     confidence: float = 0.95
@@ -69,6 +81,7 @@ class EstimateOptions:
     most_periods: int = 64
     through: float = 0.5
     drift: float = 0.02
+    alike: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -130,23 +143,11 @@ def estimate_plant(
     options: EstimateOptions = EstimateOptions(),
     windows: WindowOptions = WindowOptions(),
 ) -> PlantEstimate:
-    """Estimate the plant's response from records.
+    """Estimate the plant's response from records of one plant.
 
-    Parameters
-    ----------
-    series : TimeSeries or sequence of them
-        Of one plant, in open loop with the force as the excitation; several are cut to the length
-        of the shortest. Where they differ, as with another amplitude, the spread is wider.
-    options, windows : EstimateOptions, WindowOptions
-
-    Returns
-    -------
-    PlantEstimate
-
-    Raises
-    ------
-    UserError
-        A record is too short, nothing excites the plant, or rates or periods differ.
+    In open loop the force is the excitation. Several are cut to the length of the shortest; where
+    they differ, as with another amplitude, the spread is wider. Raises UserError where a record is
+    too short, nothing excites the plant, or rates or periods differ.
     """
     records = [series] if isinstance(series, TimeSeries) else list(series)
     step = records[0].period
@@ -203,18 +204,9 @@ def estimate_plant(
 
 
 def quantile_of(degrees: Array, options: EstimateOptions) -> Array:
-    """Find the quantile of |e|²/σ² of an error e at the stated confidence.
+    """Find the quantile of |e|²/σ² of an error e at the stated confidence, of Fisher's F(2, 2ν).
 
-    Parameters
-    ----------
-    degrees : array (k,)
-        Of freedom behind σ², complex.
-    options : EstimateOptions
-
-    Returns
-    -------
-    array (k,)
-        Of Fisher's F(2, 2ν).
+    `degrees` (k,) are those of freedom behind σ², complex.
     """
     freedom = np.maximum(degrees, 1.0)
     return np.asarray(freedom * ((1.0 - options.confidence) ** (-1.0 / freedom) - 1.0))
@@ -231,17 +223,10 @@ def require_alive(series: TimeSeries) -> None:
 
 
 def kept_lines(count: int, periods: int, options: EstimateOptions) -> np.ndarray:
-    """Find the lines of a transform that are kept.
+    """Find the lines of a transform of `count` lines that are kept.
 
-    Parameters
-    ----------
-    count, periods, options : int, int, EstimateOptions
-        Lines of the transform; whole periods of the excitation in it, 1 if it is not periodic.
-
-    Returns
-    -------
-    int array (k,)
-        Those that are excited of a periodic record, thinned where they are closer than `apart`.
+    With `periods` whole periods of the excitation in it (1: not periodic) these are the excited
+    ones, thinned where they are closer than `apart`.
     """
     lines = np.arange(periods, count - 1, periods)
     lines = lines[lines > 1] if periods == 1 else lines
@@ -268,3 +253,91 @@ def _period(excitation: Array, options: EstimateOptions) -> int:
     differs = own - 2.0 * product[lags]
     repeats = np.flatnonzero((differs <= options.repeats * own) & (own > 0.5 * squares[-1]))
     return int(lags[repeats[0]]) if len(repeats) else 0
+
+
+@dataclass(frozen=True)
+class MatrixEstimate:
+    """A plant's response by records of several channels."""
+
+    hz: Array  # (k,) lines
+    G: np.ndarray  # (k, p, m) unit of y over N
+    spread: Array  # (k, p, m) radius of each entry
+    coherence: Array  # (k,) the least of all signals and records
+
+
+def read_channels(
+    path: Path, names: SignalNames, forces: Sequence[str], positions: Sequence[str]
+) -> list[list[TimeSeries]]:
+    """Read a record as one of every force (rows) and every position (columns)."""
+    return [[read_record(path, replace(names, force=force, position=position))
+             for position in positions] for force in forces]  # fmt: skip
+
+
+def estimate_channels(
+    records: Sequence[list[list[TimeSeries]]], options: EstimateOptions = EstimateOptions()
+) -> MatrixEstimate:
+    """Estimate the response of all forces to all positions.
+
+    Records are as `read_channels` gives them, at least one a force, of unlike excitations. Raises
+    UserError where there are fewer records than forces, two excite alike, or rates and lengths
+    differ.
+    """
+    m, p = len(records[0]), len(records[0][0])
+    if len(records) < m:
+        raise UserError(f"{m} forces need {m} records, each with another excitation, and there "
+                        f"are {len(records)}")  # fmt: skip
+    every = [one for record in records for row in record for one in row]
+    for one in every:
+        require_alive(one)
+    if max(abs(one.period / every[0].period - 1.0) for one in every) > options.same_rate:
+        raise UserError("the records have several rates; give records of one rate")
+    count = min(len(one.force) for one in every)
+    fits, lines = [], np.zeros(0, int)
+    for record in records:
+        signals = [*(one.position for one in record[0]), *(row[0].force for row in record)]
+        whole = np.array([*signals, record[0][0].excitation])[:, :count]
+        spectra = np.fft.rfft(np.diff(whole), axis=1)[None] / np.sqrt(count - 1)
+        lines = kept_lines(spectra.shape[2], 1, options)
+        fits.append(fit_locally(spectra[:, :-1], spectra[:, -1], lines))
+    hz = lines / ((count - 1) * every[0].period)
+    Y, U = (np.stack([fit.G[:, part] for fit in fits], axis=2)
+            for part in (slice(None, p), slice(p, None)))  # fmt: skip
+    good = np.isfinite(Y).all(axis=(1, 2)) & np.isfinite(U).all(axis=(1, 2))
+    size = np.linalg.svd(np.where(good[:, None, None], U, 0.0), compute_uv=False)
+    unlike = size[:, m - 1] > options.alike * size[:, 0]
+    if not (good & unlike).any():
+        raise UserError("two records excite the forces alike; inject at another force in each")
+    kept = np.flatnonzero(good & unlike)
+    back = np.linalg.pinv(U[kept])
+    G = Y[kept] @ back
+    side = np.concatenate([np.broadcast_to(np.eye(p), (len(kept), p, p)), -G], axis=2)
+    variance, freedom = np.zeros(G.shape), np.zeros(len(kept))
+    for i, fit in enumerate(fits):
+        own = np.einsum("kai,kij,kaj->ka", side, fit.covariance[kept], side.conj()).real
+        variance += np.maximum(own, 0.0)[:, :, None] * np.abs(back[:, i])[:, None, :] ** 2
+        freedom += fit.degrees[kept] / len(fits)
+    spread = options.allowance * np.sqrt(variance * quantile_of(freedom, options)[:, None, None])
+    coherence = np.min([fit.coherence[kept].min(axis=1) for fit in fits], axis=0)
+    strong = np.linalg.norm(spread, axis=1) <= options.weak * np.linalg.norm(G, axis=1)
+    used = np.flatnonzero(strong.all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
+    if not len(used):
+        raise UserError("on no line is the spread below |G|: excite more, or record longer")
+    return MatrixEstimate(hz[kept][used], G[used], spread[used], coherence[used])
+
+
+def channel_findings(found: MatrixEstimate, options: EstimateOptions) -> list[tuple[str, str]]:
+    """List what is to be known of an estimate of several channels: subject and words."""
+    _, p, m = found.G.shape
+    ratio = np.median(found.spread / np.abs(found.G), axis=0)
+    worst = np.unravel_index(int(ratio.argmax()), ratio.shape)
+    at = f"position {worst[0] + 1} by force {worst[1] + 1}"
+    return [
+        ("response", f"{p} positions by {m} forces, {len(found.hz)} lines from {found.hz[0]:.4g} "
+                     f"to {found.hz[-1]:.4g} Hz, hold and delay in it; lines whose spread is above "
+                     "|G| are left out"),
+        ("spread", f"{100.0 * options.confidence:g} % confidence at each line and entry: "
+                   f"{100.0 * np.median(ratio):.2g} % of |G| in the median, "
+                   f"{100.0 * ratio.max():.3g} % of {at}"),
+        ("coherence", f"{np.median(found.coherence):.3f} in the median, least "
+                      f"{found.coherence.min():.3f}"),
+    ]  # fmt: skip

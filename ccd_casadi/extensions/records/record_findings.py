@@ -14,21 +14,11 @@ from ccd_casadi.support.text import counted, spoken
 
 @dataclass(frozen=True)
 class RecordFindingOptions:
-    """Limits beyond which something is named.
+    """Limits beyond which something is named."""
 
-    Attributes
-    ----------
-    leakage : float
-        Share of the power that the ends of the record explain.
-    most : int
-        Ranges of frequency that are named.
-    joined : float
-        Ratio of two lines below which they are of one range.
-    """
-
-    leakage: float = 0.9
-    most: int = 4
-    joined: float = 1.1
+    leakage: float = 0.9  # share of the power that the ends of the record explain
+    most: int = 4  # ranges of frequency that are named
+    joined: float = 1.1  # ratio of two lines below which they are of one range
 
 
 def ranges(

@@ -36,19 +36,8 @@ SI = {"time": "s", "force": "N", "position": "m"}
 
 
 def unit_factor(text: str) -> float | None:
-    """Find the factor of a cell that holds a unit alone.
+    """Find the factor of a cell that holds a unit alone; None where it is not a unit.
 
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    float or None
-        None: it is not a unit.
-
-    Examples
-    --------
     >>> unit_factor("[ms]"), unit_factor("speed")
     (0.001, None)
     """
@@ -64,20 +53,8 @@ def _plain(text: str) -> str:
 
 
 def parted(name: str) -> tuple[str, str]:
-    """Part the name of a column from its unit.
+    """Part the name of a column from its unit, both in small letters; "" where there is no unit.
 
-    Parameters
-    ----------
-    name : str
-        Such as "Position [mm]" or "position_mm".
-
-    Returns
-    -------
-    str, str
-        Both in small letters; the second is empty where there is no unit.
-
-    Examples
-    --------
     >>> parted("Position [mm]"), parted("force_command"), parted("pos_um"), parted("ActPosUm[0]")
     (('position', 'mm'), ('force command', ''), ('pos', 'um'), ('actpos', 'um'))
     """
@@ -96,26 +73,9 @@ def parted(name: str) -> tuple[str, str]:
 
 
 def column_of(path: Path, role: str, names: Iterable[str], stated: str | None) -> str | None:
-    """Find the column of a role.
+    """Find the column of a role of ROLES among all names; None where no column has a name of it.
 
-    Parameters
-    ----------
-    path, role : Path, str
-        Of ROLES.
-    names : iterable of str
-        Of all columns.
-    stated : str or None
-        By an option.
-
-    Returns
-    -------
-    str or None
-        None: no column has a name of it.
-
-    Raises
-    ------
-    UserError
-        The column that is stated is not there, or two columns may be meant.
+    `stated` is by an option. Raises UserError where that column is not there, or two may be meant.
     """
     names = list(names)
     if stated is not None:
@@ -132,21 +92,8 @@ def column_of(path: Path, role: str, names: Iterable[str], stated: str | None) -
 
 
 def factor_of(path: Path, role: str, name: str) -> tuple[float, str]:
-    """Find the factor of a column to SI by the unit in its name.
-
-    Parameters
-    ----------
-    path, role, name : Path, str, str
-
-    Returns
-    -------
-    float, str
-        The unit in words; "m, as no unit is named" where there is none.
-
-    Raises
-    ------
-    UserError
-        The unit is not one of the role.
+    """Find the factor of a column to SI by the unit in its name, and that unit in words, such as
+    "m, as no unit is named". Raises UserError where it is not a unit of the role.
     """
     unit = parted(name)[1]
     if unit in ("", "-", "1"):

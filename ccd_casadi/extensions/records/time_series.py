@@ -13,18 +13,10 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """Numbers of the test whether a record is sampled evenly.
+    """Numbers of the test whether a record is sampled evenly."""
 
-    Attributes
-    ----------
-    jitter : float
-        Deviation of a step from the period, over the period, up to which it is not named.
-    refused : float
-        That from which the record is refused.
-    """
-
-    jitter: float = 1e-3
-    refused: float = 0.05
+    jitter: float = 1e-3  # deviation of a step over the period, up to which it is not named
+    refused: float = 0.05  # that from which the record is refused
 
 
 @dataclass(frozen=True)
@@ -55,45 +47,21 @@ class SignalNames:
 
 @dataclass(frozen=True)
 class TimeSeries:
-    """A record of one axis; SI.
+    """A record of one axis; SI."""
 
-    Attributes
-    ----------
-    period : float
-        s, from sample to sample.
-    excitation, force, position : array (n,)
-        In open loop the excitation is the force.
-    injected : bool
-        Whether the excitation is added to the controller's force, else a reference or open loop.
-    words : str
-        How the file was understood.
-    """
-
-    period: float
-    excitation: Array
-    force: Array
-    position: Array
-    injected: bool = True
-    words: str = ""
+    period: float  # s, from sample to sample
+    excitation: Array  # (n,) in open loop the force
+    force: Array  # (n,)
+    position: Array  # (n,)
+    injected: bool = True  # whether the excitation is added to the controller's force
+    words: str = ""  # how the file was understood
 
 
 def read_record(path: Path, names: SignalNames = SignalNames()) -> TimeSeries:
-    """Read a record.
+    """Read a record from CSV, .npz, .mat or WAV.
 
-    Parameters
-    ----------
-    path : Path
-        CSV, .npz, .mat or WAV.
-    names : SignalNames
-
-    Returns
-    -------
-    TimeSeries
-
-    Raises
-    ------
-    UserError
-        A column is missing or may be one of two, a unit is not known, or samples are missing.
+    Raises UserError where a column is missing or may be one of two, a unit is not known, or samples
+    are missing.
     """
     columns, rate, notes = read_columns(path)
     if names.injected and names.reference:

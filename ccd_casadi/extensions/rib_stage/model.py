@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.extensions.rib_stage import geometry as shape
+from ccd_casadi.extensions.rib_stage import stage_modes
 from ccd_casadi.extensions.rib_stage.assembly import AS, SA
 from ccd_casadi.extensions.rib_stage.geometry import (
     RIGID_NAMES,
@@ -20,17 +21,6 @@ from ccd_casadi.extensions.rib_stage.geometry import (
     has_square_symmetry,
     rigid_fields,
     rigid_values,
-)
-from ccd_casadi.extensions.rib_stage.stage_modes import (
-    Discretisation,
-    Group,
-    GroupModes,
-    StageModeOptions,
-    discretise,
-    group_modes,
-    groups_of,
-    heights,
-    spectrum,
 )
 from ccd_casadi.plants.finite_elements import StageError
 from ccd_casadi.plants.plant import Mechanics
@@ -59,7 +49,7 @@ class ModeCount:
         """Flexible modes in all."""
         return self.A1 + self.B1 + self.B2 + self.A2 + 2 * self.tilt
 
-    def of(self, group: Group) -> int:
+    def of(self, group: stage_modes.Group) -> int:
         """Modes solved of a group of symmetries."""
         return sum(getattr(self, "tilt" if s in (SA, AS) else s.name) for s in group.solved)
 
@@ -85,7 +75,7 @@ class Mode:
 class ModeSet:
     """The modes solved at one θ and the flexible ones kept of them, in the model's order."""
 
-    spectra: tuple[GroupModes, ...]
+    spectra: tuple[stage_modes.GroupModes, ...]
     flexible: tuple[Mode, ...]
 
     def kept(self, group: int) -> int:
@@ -111,7 +101,7 @@ def faded(values: Array, slopes: Array, full: int) -> tuple[Array, Array]:
 
 
 def solve_modes(
-    disc: Discretisation,
+    disc: stage_modes.Discretisation,
     geometry: Geometry,
     theta: Array,
     count: ModeCount,
@@ -128,18 +118,20 @@ def solve_modes(
     """
     square = has_square_symmetry(geometry)
     wanted = {}
-    for group in groups_of(geometry):
+    for group in stage_modes.groups_of(geometry):
         number = count.of(group)
         if by_frequency:  # no symmetry of the square has more than half of the lowest
             number = max(count.total // 2, 1) if square else count.total
         if number:
             wanted[group] = number
-    boxes = disc.assembler.box_matrices(theta, StageModeOptions.shift)
+    boxes = disc.assembler.box_matrices(theta, stage_modes.StageModeOptions.shift)
 
-    def solved(group: Group) -> GroupModes:
+    def solved(group: stage_modes.Group) -> stage_modes.GroupModes:
         keep = wanted[group] + fading
-        found = spectrum(disc, geometry, theta, group, keep + StageModeOptions.extra, boxes)
-        return group_modes(disc, geometry, found, keep + bool(fading), points)
+        found = stage_modes.spectrum(
+            disc, geometry, theta, group, keep + stage_modes.StageModeOptions.extra, boxes
+        )
+        return stage_modes.group_modes(disc, geometry, found, keep + bool(fading), points)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
     found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
@@ -156,7 +148,7 @@ def solve_modes(
     return ModeSet(spectra, tuple(flexible))
 
 
-def _mode(item: GroupModes, group: int, place: int, image: int) -> Mode:
+def _mode(item: stage_modes.GroupModes, group: int, place: int, image: int) -> Mode:
     symmetries = item.group.images[image]
     known = len(symmetries) == 1
     hertz = float(np.sqrt(item.values[place]) / (2.0 * np.pi))
@@ -267,9 +259,9 @@ def _checked(stage: RibStage, theta: Sequence[float]) -> tuple[float, ...]:
     return values
 
 
-def discretisation(stage: RibStage) -> Discretisation:
+def discretisation(stage: RibStage) -> stage_modes.Discretisation:
     """Mesh and sparsity patterns of a stage, shared by all of its θ."""
-    return discretise(stage.order, stage.geometry.side, stage.geometry.material)
+    return stage_modes.discretise(stage.order, stage.geometry.side, stage.geometry.material)
 
 
 def modes_at(stage: RibStage, theta: tuple[float, ...], points: tuple[Point, ...] = ()) -> ModeSet:
@@ -368,7 +360,7 @@ def _displacements(
 
     for index, item in enumerate(found.spectra):
         keep = found.kept(index)
-        F, _ = heights(disc, item.group, theta, points)
+        F, _ = stage_modes.heights(disc, item.group, theta, points)
         own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
         seen = [
             slice(k * len(points), (k + 1) * len(points)) for k in range(len(item.group.images))

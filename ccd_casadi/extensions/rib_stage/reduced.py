@@ -61,27 +61,13 @@ RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 
 @dataclass(frozen=True)
 class ReducedBasisOptions:
-    """Numbers of the reduced basis.
+    """Numbers of the reduced basis."""
 
-    Attributes
-    ----------
-    known_slope : float
-        Share of its length up to which a mode's derivative may lie beside the basis.
-    known_mode : float
-        The same of a mode: rounding.
-    beyond : int
-        Modes of a symmetry beyond those kept, by which shapes change.
-    levels : int
-        Static responses to forces, as levels of a Krylov space.
-    coupled : int
-        Lowest modes of each symmetry that point masses couple.
-    """
-
-    known_slope: float = 1e-4
-    known_mode: float = 1e-8
-    beyond: int = 4
-    levels: int = 2
-    coupled: int = 24
+    known_slope: float = 1e-4  # share of a mode's derivative that may lie beside the basis
+    known_mode: float = 1e-8  # the same of a mode: rounding
+    beyond: int = 4  # modes of a symmetry beyond those kept, by which shapes change
+    levels: int = 2  # static responses to forces, as levels of a Krylov space
+    coupled: int = 24  # lowest modes of each symmetry that point masses couple
 
 
 Theta = tuple[float, ...]

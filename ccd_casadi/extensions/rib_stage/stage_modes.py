@@ -122,28 +122,14 @@ def groups_of(geometry: Geometry) -> tuple[Group, ...]:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Flexible modes of a group at θ.
-
-    Attributes
-    ----------
-    group : Group
-    theta : array (θ,)
-    pencil : Pencil
-        Products with M, and the factorisation of K + shift M.
-    rigid : array (n, r)
-        Rigid-body motions, ΦᵀMΦ = I.
-    values : array (k,)
-        λ in rad²/s², ascending.
-    vectors : array (n, k)
-        Φ, ΦᵀMΦ = I.
-    """
+    """Flexible modes of a group at θ."""
 
     group: Group
     theta: Array
-    pencil: Pencil
-    rigid: Array
-    values: Array
-    vectors: Array
+    pencil: Pencil  # products with M, and the factorisation of K + shift M
+    rigid: Array  # (n, r) rigid-body motions, ΦᵀMΦ = I
+    values: Array  # (k,) λ in rad²/s², ascending
+    vectors: Array  # (n, k) Φ, ΦᵀMΦ = I
 
 
 def sector_of(disc: Discretisation, symmetry: Symmetry) -> Sector:

@@ -38,30 +38,14 @@ from ccd_casadi.support.arrays import Array, states
 
 @dataclass(frozen=True)
 class CrossingOptions:
-    """Numbers of the simulation on the way.
+    """Numbers of the simulation on the way."""
 
-    Attributes
-    ----------
-    positions : int
-        At which the plant's matrices are evaluated; linear between them.
-    slowest : float
-        Time over the range of the first rate, in periods of the least ω_b; then halved.
-    trials : int
-        Rates at most.
-    rests : int
-        Positions at rest to compare with.
-    rise : float
-        Of the largest motion, over that at rest, which a rate that is allowed does not exceed.
-    longest : int
-        Periods of the way at one rate that are simulated at most.
-    """
-
-    positions: int = 401
-    slowest: float = 160.0
-    trials: int = 7
-    rests: int = 9
-    rise: float = 1.25
-    longest: int = 400_000
+    positions: int = 401  # at which the plant's matrices are evaluated; linear between them
+    slowest: float = 160.0  # first time over the range, in periods of the least ω_b; then halved
+    trials: int = 7  # rates at most
+    rests: int = 9  # positions at rest to compare with
+    rise: float = 1.25  # of the largest motion, over that at rest, that is allowed
+    longest: int = 400_000  # periods of the way at one rate that are simulated at most
 
 
 @dataclass(frozen=True)
@@ -112,22 +96,12 @@ def part_at(segments: Sequence[Segment], now: int, p: float) -> int:
 
 @dataclass(frozen=True)
 class Way:
-    """The loop along the range, its sampled plant linear between places.
+    """The loop along the range, its sampled plant linear between places."""
 
-    Attributes
-    ----------
-    segments, K : sequence of Segment, of StateSpace
-        The parts, and K(z) of each.
-    places : array (N,)
-        Evenly over the range.
-    plants : sequence of StateSpace
-        At these, sampled.
-    """
-
-    segments: Sequence[Segment]
-    K: Sequence[StateSpace]
-    places: Array
-    plants: Sequence[StateSpace]
+    segments: Sequence[Segment]  # the parts
+    K: Sequence[StateSpace]  # K(z) of each
+    places: Array  # (N,) evenly over the range
+    plants: Sequence[StateSpace]  # at these, sampled
 
     def longest(self, options: CrossingOptions) -> float:
         """Time over the range at the first rate, s."""

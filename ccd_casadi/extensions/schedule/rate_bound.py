@@ -44,25 +44,13 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class RateBoundOptions:
-    """Numbers of the bound.
+    """Numbers of the bound."""
 
-    Attributes
-    ----------
-    positions : int
-        N of each part.
-    halvings : int
-        Of the interval of rates.
-    share : float
-        s.
-    decades, weights : float, int
-        To each side of 1 and count of w_f/w_s.
-    """
-
-    positions: int = 101
-    halvings: int = 18
-    share: float = 0.8
-    decades: float = 4.0
-    weights: int = 65
+    positions: int = 101  # N of each part
+    halvings: int = 18  # of the interval of rates
+    share: float = 0.8  # s
+    decades: float = 4.0  # to each side of 1, of w_f/w_s
+    weights: int = 65  # their number
 
 
 @dataclass(frozen=True)
@@ -143,25 +131,13 @@ def borders(segments: Sequence[Segment]) -> list[Border]:
 
 @dataclass(frozen=True)
 class RateBound:
-    """The allowed rate of p.
+    """The allowed rate of p."""
 
-    Attributes
-    ----------
-    rate : float
-        r, unit of p per second; 0: none.
-    positions : int
-        N.
-    part, at : int, float or None
-        That set it: the part, from 0, and where it hands over; None: V stops falling inside.
-    waits : tuple of float
-        Of each part, s: it keeps control for so long at least.
-    """
-
-    rate: float
-    positions: int
-    part: int
-    at: float | None
-    waits: tuple[float, ...]
+    rate: float  # r, unit of p per second; 0: none
+    positions: int  # N
+    part: int  # that set it, from 0
+    at: float | None  # where it hands over; None: V stops falling inside
+    waits: tuple[float, ...]  # of each part, s: it keeps control for at least as long
 
 
 def rate_bound(

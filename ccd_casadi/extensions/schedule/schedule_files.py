@@ -44,20 +44,11 @@ CODE = ("schedule.h", "schedule.c")
 
 @dataclass(frozen=True)
 class FrozenPosition:
-    """A position at rest, with each part that may control there.
-
-    Attributes
-    ----------
-    at : float
-    failed : tuple of int
-        Parts, from 0, that exceed a bound on a plant of the set there.
-    bandwidth : float
-        On the model there, the slowest of the parts, rad/s.
-    """
+    """A position at rest, with each part that may control there."""
 
     at: float
-    failed: tuple[int, ...]
-    bandwidth: float
+    failed: tuple[int, ...]  # parts, from 0, that exceed a bound on a plant of the set there
+    bandwidth: float  # on the model there, the slowest of the parts, rad/s
 
     @property
     def passed(self) -> bool:
@@ -67,32 +58,17 @@ class FrozenPosition:
 
 @dataclass(frozen=True)
 class Schedule:
-    """A schedule and what is known of it.
+    """A schedule and what is known of it."""
 
-    Attributes
-    ----------
-    name, unit : str
-        Of the parameter that is measured.
-    segments : tuple of Segment
-    alone : tuple of Alone
-    whole : float
-        ω_b of one controller for all of the range, rad/s.
-    frozen : tuple of FrozenPosition
-    rates : tuple of RateTrial
-    bound : RateBound
-    crossed : RateTrial
-        The simulation at this bound.
-    """
-
-    name: str
-    unit: str
+    name: str  # of the parameter that is measured
+    unit: str  # of it
     segments: tuple[Segment, ...]
     alone: tuple[Alone, ...]
-    whole: float
+    whole: float  # ω_b of one controller for all of the range, rad/s
     frozen: tuple[FrozenPosition, ...]
     rates: tuple[RateTrial, ...]
     bound: RateBound
-    crossed: RateTrial
+    crossed: RateTrial  # the simulation at this bound
 
     @property
     def verified(self) -> bool:

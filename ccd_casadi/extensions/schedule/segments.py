@@ -36,65 +36,32 @@ from ccd_casadi.support.text import counted
 
 @dataclass(frozen=True)
 class ScheduleOptions:
-    """Numbers of a schedule.
+    """Numbers of a schedule."""
 
-    Attributes
-    ----------
-    share : float
-        Of the bandwidth that a position has alone, which its part has at least.
-    most : int
-        Parts at most.
-    overlap : float
-        d, over the width of the part that is halved.
-    positions : int
-        At which a controller for that position alone is searched, evenly over the range.
-    refinements : int
-        Times at most that positions at which a part exceeds a bound join its design.
-    boxes : int
-        Enclosures of the proof of a part at most: some two minutes.
-    """
-
-    share: float = 0.9
-    most: int = 8
-    overlap: float = 0.05
-    positions: int = 5
-    refinements: int = 3
-    boxes: int = 4_000_000
+    share: float = 0.9  # of the bandwidth that a position has alone, which its part has at least
+    most: int = 8  # parts at most
+    overlap: float = 0.05  # d, over the width of the part that is halved
+    positions: int = 5  # at which a controller for it alone is searched, evenly over the range
+    refinements: int = 3  # times that positions at which a part exceeds a bound join its design
+    boxes: int = 4_000_000  # enclosures of the proof of a part at most: some two minutes
 
 
 @dataclass(frozen=True)
 class DesignedPart:
-    """A part of the range with the controller that was found for it.
+    """A part of the range with the controller that was found for it."""
 
-    Attributes
-    ----------
-    low, high : float
-        Of p, SI.
-    problem : CoDesignProblem
-        With p in [low, high], and with what the search found.
-    design : SectionsDesign
-    """
-
-    low: float
-    high: float
-    problem: CoDesignProblem
+    low: float  # of p, SI
+    high: float  # of p, SI
+    problem: CoDesignProblem  # with p in [low, high], and with what the search found
     design: SectionsDesign
 
 
 @dataclass(frozen=True)
 class Segment(DesignedPart):
-    """A part that was judged.
+    """A part that was judged."""
 
-    Attributes
-    ----------
-    judgement : Judgement
-        On plants of the part.
-    proof : Proof
-        On all of the part.
-    """
-
-    judgement: Judgement
-    proof: Proof
+    judgement: Judgement  # on plants of the part
+    proof: Proof  # on all of the part
 
     @property
     def passed(self) -> bool:

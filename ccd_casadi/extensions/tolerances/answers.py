@@ -45,38 +45,17 @@ from ccd_casadi.support.time_budget import within_budget
 
 @dataclass(frozen=True)
 class ToleranceCase:
-    """A case with the problem of its whole box.
-
-    Attributes
-    ----------
-    case, problem : Case, CoDesignProblem
-    plan : Plan or None
-        Of its share, where it has one.
-    distribution : mapping
-        By tolerance; uniform where it has none.
-    """
+    """A case with the problem of its whole box."""
 
     case: Case
     problem: CoDesignProblem
-    plan: Plan | None
-    distribution: Mapping[str, str]
+    plan: Plan | None  # of its share, where it has one
+    distribution: Mapping[str, str]  # by tolerance; uniform where it has none
 
 
 def tolerance_case(case: Case) -> ToleranceCase:
-    """Check what a case says of its tolerances.
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    ToleranceCase
-
-    Raises
-    ------
-    UserError
-        A key has no effect, or what it names cannot be kept for a share.
+    """Check what a case says of its tolerances. Raises UserError where a key has no effect, or what
+    it names cannot be kept for a share.
     """
     table = case.robust
 
@@ -129,44 +108,22 @@ def _require_known(
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command ends with.
+    """What a command ends with."""
 
-    Attributes
-    ----------
-    entry : dict
-        Of tolerances.json.
-    words : tuple of str
-        Lines for the terminal.
-    good : bool
-        Whether what is required is shown.
-    files : dict
-        Content of further files by name: JSON values, or text.
-    """
-
-    entry: dict[str, Any]
-    words: tuple[str, ...]
-    good: bool
-    files: dict[str, Any]
+    entry: dict[str, Any]  # of tolerances.json
+    words: tuple[str, ...]  # lines for the terminal
+    good: bool  # whether what is required is shown
+    files: dict[str, Any]  # content of further files by name: JSON values, or text
 
 
 @dataclass(frozen=True)
 class ShareDesign:
-    """A design for a share of machines, judged.
+    """A design for a share of machines, judged."""
 
-    Attributes
-    ----------
-    whole : SectionsDesign or None
-        For the whole box at `whole_theta`; None where there is none.
-    search : ShareSearch
-    design : SectionsDesign
-        Certified anew on its working set.
-    certificate : ShareCertificate
-    """
-
-    whole: SectionsDesign | None
+    whole: SectionsDesign | None  # for the whole box at `whole_theta`; None where there is none
     whole_theta: tuple[float, ...]
     search: ShareSearch
-    design: SectionsDesign
+    design: SectionsDesign  # certified anew on its working set
     certificate: ShareCertificate
 
 
@@ -175,20 +132,7 @@ def design_for_share(
 ) -> ShareDesign:
     """The whole box first, from there the share, then fresh draws.
 
-    Parameters
-    ----------
-    of : ToleranceCase
-        With a plan.
-    sampler : Sampler
-        Of its problem.
-    theta : tuple of float or None
-        The machine, SI; None: it is searched.
-    seed, minutes : int, float
-        Of every draw; of each of the two searches.
-
-    Returns
-    -------
-    ShareDesign
+    `theta` is the machine in SI; None: it is searched. Each of the two searches has its `minutes`.
     """
     assert of.plan is not None
 
@@ -217,16 +161,7 @@ def design_for_share(
 
 
 def share_answer(found: ShareDesign) -> Answer:
-    """The verdict, the design, and what it gains over that for the whole box.
-
-    Parameters
-    ----------
-    found : ShareDesign
-
-    Returns
-    -------
-    Answer
-    """
+    """The verdict, the design, and what it gains over that for the whole box."""
     search, design, whole = found.search, found.design, found.whole
     problem, theta, line = search.problem, search.best.theta, found.certificate.line
     good = found.certificate.passed and design.certified

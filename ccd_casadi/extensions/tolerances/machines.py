@@ -35,28 +35,14 @@ Machine = tuple[int, Array]  # option, point of the box
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """Numbers of the draws.
+    """Numbers of the draws."""
 
-    Attributes
-    ----------
-    sigmas : float
-        Standard deviations from the model to an end of the range.
-    enough : float
-        Fresh draws, over the least number that shows the share where none fails.
-    reliable : float
-        Probability that a search does not end with a design that its certificate refuses.
-    confirming, most : int
-        Rounds of the certificate's number of draws that accept a design, at least and at most.
-    attempts : int
-        Designs of a search that such rounds may judge.
-    """
-
-    sigmas: float = 3.0
-    enough: float = 3.0
-    reliable: float = 0.999
-    confirming: int = 6
-    most: int = 64
-    attempts: int = 8
+    sigmas: float = 3.0  # standard deviations from the model to an end of the range
+    enough: float = 3.0  # fresh draws, over the least number that shows the share where none fails
+    reliable: float = 0.999  # probability that the certificate accepts what a search ends with
+    confirming: int = 6  # rounds of the certificate's draws that accept a design, at least
+    most: int = 64  # the same at most
+    attempts: int = 8  # designs of a search that such rounds may judge
 
 
 def tolerance_of(name: str) -> str:
@@ -104,13 +90,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Plan:
-    """How many draws decide on a share at a confidence, and what accepts a design before.
-
-    Attributes
-    ----------
-    share, confidence : float
-    options : MachineOptions
-    """
+    """How many draws decide on a share at a confidence, and what accepts a design before."""
 
     share: float
     confidence: float
@@ -160,37 +140,19 @@ class Plan:
 
 @dataclass(frozen=True)
 class ShareCertificateOptions:
-    """Numbers of the certificate.
+    """Numbers of the certificate."""
 
-    Attributes
-    ----------
-    batch : int
-        Machines that are judged at once.
-    seed : int
-        Beside the run's: no search draws with it.
-    """
-
-    batch: int = 250
-    seed: int = 5000
+    batch: int = 250  # machines that are judged at once
+    seed: int = 5000  # beside the run's: no search draws with it
 
 
 @dataclass(frozen=True)
 class ShareCertificate:
-    """How many fresh machines keep every bound.
+    """How many fresh machines keep every bound."""
 
-    Attributes
-    ----------
-    plan : Plan
-        The share, its confidence, and the number of draws.
-    failed : int
-        Of these.
-    not_evaluated : int
-        Of those that failed: where the evaluation raised.
-    """
-
-    plan: Plan
-    failed: int
-    not_evaluated: int = 0
+    plan: Plan  # the share, its confidence, and the number of draws
+    failed: int  # of these
+    not_evaluated: int = 0  # of those that failed: where the evaluation raised
 
     @property
     def least(self) -> float:
@@ -240,24 +202,7 @@ def certified_share(
     on_box: DesignOnBox, plan: Plan, distribution: Mapping[str, str], seed: int,
     workers: Pool | None = None, options: ShareCertificateOptions = ShareCertificateOptions(),
 ) -> ShareCertificate:  # fmt: skip
-    """Judge a design on fresh draws.
-
-    Parameters
-    ----------
-    on_box : DesignOnBox
-        The design at its θ.
-    plan, distribution : Plan, mapping
-        How many draws, and of what.
-    seed : int
-        Of the run.
-    workers : Pool, optional
-        The result is the same for any number.
-    options : ShareCertificateOptions
-
-    Returns
-    -------
-    ShareCertificate
-    """
+    """Judge a design at its θ on fresh draws; the result is the same for any number of workers."""
     rng = np.random.default_rng((seed, options.seed))
     fresh = draw_machines(on_box.uncertain, distribution, rng, plan.draws)
     size = options.batch

@@ -50,25 +50,13 @@ SHARES = ("resonance_shift", "mode_shift", "gain")  # half-widths as shares
 
 @dataclass(frozen=True)
 class Price:
-    """What one tolerance costs, in rad/s.
+    """What one tolerance costs, in rad/s."""
 
-    Attributes
-    ----------
-    name, width : str
-        Which, and how wide it is, in words.
-    cost : float
-        ω_b without it, less ω_b with it.
-    half_buys : float
-        ω_b with half of it, less ω_b with it.
-    slope : float
-        -dω_b/d ln t by the multipliers; NaN where they are not known.
-    """
-
-    name: str
-    width: str
-    cost: float
-    half_buys: float
-    slope: float
+    name: str  # of the tolerance
+    width: str  # how wide it is, in words
+    cost: float  # ω_b without it, less ω_b with it
+    half_buys: float  # ω_b with half of it, less ω_b with it
+    slope: float  # -dω_b/d ln t by the multipliers; NaN where they are not known
 
     @property
     def entry(self) -> dict[str, Any]:
@@ -173,51 +161,25 @@ def prices(
 
 @dataclass(frozen=True)
 class WidthOptions:
-    """Numbers of the search over half-widths.
+    """Numbers of the search over half-widths."""
 
-    Attributes
-    ----------
-    evaluations : int
-        At most, before the corners.
-    corners : int
-        Of the bounds, that are evaluated where there are no more.
-    settled : float
-        Relative change of J that ends it.
-    polish : float
-        Of J: steps over θ that promise less are not taken.
-    usual : tuple of float
-        Bounds of a half-width over the case's, where it has none.
-    """
-
-    evaluations: int = 15
-    corners: int = 8
-    settled: float = 1e-4
-    polish: float = 1e-5
-    usual: tuple[float, float] = (0.25, 2.0)
+    evaluations: int = 15  # at most, before the corners
+    corners: int = 8  # of the bounds, that are evaluated where there are no more
+    settled: float = 1e-4  # relative change of J that ends it
+    polish: float = 1e-5  # of J: steps over θ that promise less are not taken
+    usual: tuple[float, float] = (0.25, 2.0)  # bounds of a half-width over the case's
 
 
 @dataclass(frozen=True)
 class Bought:
-    """A machine, its controller and its tolerances.
+    """A machine, its controller and its tolerances."""
 
-    Attributes
-    ----------
-    widths : mapping
-        Half-widths by name, as shares.
-    theta, kappa : tuple of float, array
-        SI.
-    bandwidth, objective : float
-        rad/s; J with what the tolerances cost.
-    slopes : mapping
-        ∂J/∂ln t; none where the multipliers are not known.
-    """
-
-    widths: Mapping[str, float]
-    theta: tuple[float, ...]
-    kappa: Array
-    bandwidth: float
-    objective: float
-    slopes: Mapping[str, float]
+    widths: Mapping[str, float]  # half-widths by name, as shares
+    theta: tuple[float, ...]  # SI
+    kappa: Array  # SI
+    bandwidth: float  # rad/s
+    objective: float  # J with what the tolerances cost
+    slopes: Mapping[str, float]  # ∂J/∂ln t; none where the multipliers are not known
 
 
 @dataclass(frozen=True)
@@ -268,24 +230,10 @@ def buy(
     between: Mapping[str, Sequence[float]], tell: Callable[[Bought], object],
     options: WidthOptions = WidthOptions(),
 ) -> WidthSearch | None:  # fmt: skip
-    """Search half-widths, machine and controller together.
+    """Search half-widths, machine and controller together, from θ and κ of a finished run, SI.
 
-    Parameters
-    ----------
-    sampler : Sampler
-        Of a case's problem.
-    theta, kappa : sequence of float, array
-        Of a finished run, SI.
-    costs, between : mapping
-        What f rises by for a percent, by name; least and largest half-width.
-    tell : callable
-        Is given every design.
-    options : WidthOptions
-
-    Returns
-    -------
-    WidthSearch or None
-        None where the run's design is not found again.
+    `costs` are what f rises by for a percent, `between` the least and largest half-width, both by
+    name; `tell` is given every design. None where the run's design is not found again.
     """
     own = structured_of(sampler.problem).uncertainty
     case = {name: getattr(own, name) for name in costs}

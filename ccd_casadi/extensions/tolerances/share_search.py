@@ -82,35 +82,17 @@ class ShareOptions:
 
 @dataclass(frozen=True)
 class ShareSearch:
-    """A search as far as it is.
+    """A search as far as it is."""
 
-    Attributes
-    ----------
-    sampler : Sampler
-        Of the problem whose scenarios are the working set.
-    best : InnerSample
-        θ and κ on that set.
-    plan, distribution, seed : Plan, mapping, int
-        What is required, how tolerances are drawn, and the run's seed.
-    tail : tuple of Machine
-        Draws that are ranked again.
-    rounds : int
-        Of new draws, each of the certificate's number.
-    settled : bool
-        Whether new draws have accepted it.
-    whole_box : tuple of float
-        κ in SI of the design for the whole box, from which a search may start again.
-    """
-
-    sampler: Sampler
-    best: InnerSample
-    plan: Plan
-    distribution: Mapping[str, str]
-    seed: int
-    tail: tuple[Machine, ...] = ()
-    rounds: int = 0
-    settled: bool = False
-    whole_box: tuple[float, ...] = ()
+    sampler: Sampler  # of the problem whose scenarios are the working set
+    best: InnerSample  # θ and κ on that set
+    plan: Plan  # what is required
+    distribution: Mapping[str, str]  # how tolerances are drawn
+    seed: int  # the run's
+    tail: tuple[Machine, ...] = ()  # draws that are ranked again
+    rounds: int = 0  # of new draws, each of the certificate's number
+    settled: bool = False  # whether new draws have accepted it
+    whole_box: tuple[float, ...] = ()  # κ (SI) of the design for the whole box, to start from again
 
     @property
     def problem(self) -> CoDesignProblem:
@@ -279,22 +261,8 @@ def started(
 def search_share(
     search: ShareSearch, tell: Tell, *, moves: bool, options: ShareOptions = ShareOptions()
 ) -> ShareSearch:
-    """Search over θ and controller.
-
-    Parameters
-    ----------
-    search : ShareSearch
-        As it begins.
-    tell : callable
-        Is given lines of progress.
-    moves : bool
-        Whether θ may move.
-    options : ShareOptions
-
-    Returns
-    -------
-    ShareSearch
-        The best, settled where the plan's trial has accepted it.
+    """Search over θ, where it may move, and controller: the best, settled where the plan's trial
+    has accepted it. `tell` is given lines of progress.
     """
     trial = search.plan.trial
     short = Trial(1, -(-trial.allowed // trial.rounds))

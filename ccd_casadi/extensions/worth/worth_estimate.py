@@ -228,14 +228,8 @@ def outlook(
 
         EI = Δ Φ(Δ/σ) + σ φ(Δ/σ),   δ = 2 max EI/|w₂| + prediction error,
 
-    over candidates in boxes around the best θ that meet λ <= 0 and are not evaluated yet.
-
-    Parameters
-    ----------
-    samples : list of InnerSample
-        All true designs.
-    prediction_error : float
-        |truth - prediction| of the last true design, rad/s.
+    over candidates in boxes around the best θ that meet λ <= 0 and are not evaluated yet. `samples`
+    are all true designs, the prediction error |truth - prediction| of the last of them, rad/s.
     """
     certified = [sample for sample in samples if sample.feasible]
     if len(certified) <= len(problem.names):
