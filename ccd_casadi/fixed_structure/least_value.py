@@ -81,8 +81,8 @@ class Goal(Protocol):
         The plants may be spread over workers.
         """
 
-    def to_theta(self, kappa: Array) -> Array:
-        """∂ ln v/∂θ at a fixed κ."""
+    def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
+        """∂ ln v/∂θ at a fixed κ; as `at`."""
 
     def shown(self, value: float) -> str:
         """v with its unit."""
@@ -119,7 +119,7 @@ class RmsError:
         steps = 1j * COMPLEX_STEP * np.eye(len(kappa) + 1, len(kappa), -1)
         return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants), workers)
 
-    def to_theta(self, kappa: Array) -> Array:
+    def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
         step = 1j * COMPLEX_STEP
         moved = [
@@ -127,7 +127,7 @@ class RmsError:
              for dA, dB, dC in plant.changes_si()]
             for G, plant in ((plant.plant_si(), plant) for plant in self.plants)
         ]  # fmt: skip
-        return self._of_mean(np.asarray(kappa, complex)[None], moved)[1]
+        return self._of_mean(np.asarray(kappa, complex)[None], moved, workers)[1]
 
     def shown(self, value: float) -> str:
         return spoken(f"{1e9 * value:.4g} nm RMS")
@@ -226,7 +226,8 @@ def least_value(
     descent = _Descent(problem, goal, options.reward, floor)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
-    first = float(np.exp(goal.at(design.kappa)[0]))
+    near = workers if isinstance(workers, Workers) else None  # a cluster is too far for a plant
+    first = float(np.exp(goal.at(design.kappa, near)[0]))
     best = LeastValue(design, first, first, 0, None)
     steps, known = 0, list[Array]()
     left = deque([*((np.inf, tuple(map(float, item))) for item in initial), own, *others])
@@ -252,8 +253,8 @@ def least_value(
             begins.append(np.append(begin, tau))
         if best.design is not design and ends_early("least-value start", len(begins)):
             break
-        if len(begins) == 1 and isinstance(workers, Workers):  # a cluster is too far for a plant
-            ends = {0: _descended(descent, begins[0], known, workers)}
+        if len(begins) == 1 and near is not None:
+            ends = {0: _descended(descent, begins[0], known, near)}
         else:
             tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
             ends = dict(results(workers, _descended, tasks))
@@ -271,7 +272,7 @@ def least_value(
             at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
             tell(f"{at}, {count} steps: {made.words}")
             if made.certified and value < best.value:
-                direct = goal.to_theta(made.kappa)
+                direct = goal.to_theta(made.kappa, near)
                 envelope = envelope_of(problem, end.x[:-1], conditions, direct)
                 if envelope is not None:
                     envelope = envelope.times(value)

@@ -132,11 +132,12 @@ class DesignOnBox:
         self, turns: range, workers: Pool, tell: Tell
     ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of several searches, and those to add of the first that finds any; as
-        many at a time as there are workers."""
+        many at a time as there are workers, which share one that is left over."""
         seen: list[Excess] = []
         for first in turns[:: workers.count]:
             own = range(first, min(first + workers.count, turns.stop))
-            found = dict(results(workers, self.worst, {turn: (turn,) for turn in own}))
+            inside = (silent, workers) if len(own) == 1 else ()
+            found = dict(results(workers, self.worst, {turn: (turn, *inside) for turn in own}))
             seen += [worst for worst, _ in found.values()]
             largest = max(seen, key=lambda one: one.value)
             tell(f"{of_a_bound(largest.value)} at most, searched from elsewhere")

@@ -151,6 +151,9 @@ class OneSampler(SimpleNamespace):
     def of(self, other: CoDesignProblem, *, traced: bool = True) -> "OneSampler":
         return OneSampler(problem=other)
 
+    def side_by_side(self, searches: list[Any]) -> list[Any]:
+        return [each.run(self.of(each.problem), each.given) for each in searches]
+
 
 def two_lists(rng: np.random.Generator) -> CoDesignProblem:
     lists = {
