@@ -39,7 +39,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, of_a_bound
 
@@ -240,9 +240,9 @@ class DesignOnBox:
         )  # fmt: skip
 
     def judged(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":
-        """On a lattice and by proof, at one time; of several options, whose proofs are spread over
-        the workers, one after the other."""
-        if structured_of(self.problem).uncertainty.options:
+        """On a lattice and by proof, one after the other, each spread over the workers; at one time
+        by those of a cluster, unless there are several options."""
+        if isinstance(workers, Workers) or structured_of(self.problem).uncertainty.options:
             return *self.on_lattice(worst, workers), self.proof(workers)
         tasks = {"proof": (self.proof,), "lattice": (self.on_lattice, worst)}
         found = dict(results(workers, call, tasks))
