@@ -6,6 +6,7 @@ end is stored whole (`kept`), with the controller, as it is made.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -77,12 +78,15 @@ class IndependentSearch:
     given : object
     traced : bool
         As of `Sampler.of`.
+    stored : bool
+        Whether the store has what takes long in it, so that it soon is where another process was.
     """
 
     run: Callable[["Sampler", Any], Any]
     problem: CoDesignProblem
     given: Any
     traced: bool
+    stored: bool
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,10 @@ class _Record:
     units: dict[str, tuple[str, int]]
     trace: tuple[TraceEntry, ...]
     bandwidth_at_start: float | None
+
+
+# What a search finds, its units and trace, and its budget with what was left.
+_Done = tuple[Any, dict[str, tuple[str, int]], list[TraceEntry], TimeBudget]
 
 
 class Sampler:
@@ -168,28 +176,33 @@ class Sampler:
         worker, on the same store.
 
         Each begins with the record of this run, and what it adds joins that in their order, so that
-        all is the same for any number of workers. The workers of a cluster have no such store: they
-        share one search after another.
+        all is the same for any number of workers. All workers share the last one, which begins
+        again with what is `stored`. Those of a cluster have no such store: they share each.
         """
         own, spent = budget(), self.spent
         record = _Record(spent.purpose, spent.units, tuple(self.trace), self.bandwidth_at_start)
         path = self.store.path.absolute()
         tasks = {i: (one, path, record, TimeBudget(own.minutes, own.began))
                  for i, one in enumerate(searches)}  # fmt: skip
+        done: dict[int, _Done] = {}
         if isinstance(self.workers, Workers):
-            done = dict(results(self.workers, _alone, tasks))
-        else:
-            done = {i: _alone(*task, self.workers) for i, task in tasks.items()}
+            with closing(results(self.workers, _alone, tasks)) as found:
+                for i, one in found:
+                    done[i] = one
+                    last = [search for j, search in enumerate(searches) if j not in done]
+                    if len(last) == 1 and last[0].stored and self.workers.count > 1:
+                        break  # which ends the worker that has it
+        done |= {i: _alone(*tasks[i], self.workers) for i in tasks if i not in done}
         before = spent.total
         for i, search in enumerate(searches):
             _, units, trace, left = done[i]
             more = spent.total - before  # of the searches before it
             spent.add(units)
             own.with_left_of(left)
-            known = trace[: len(record.trace)]
             if not search.traced:
                 continue
-            if np.isnan([entry.objective for entry in known]).all():  # it has found worse plants
+            known = trace[: len(record.trace)]
+            if known and np.isnan([entry.objective for entry in known]).all():  # on worse plants
                 self.trace[:] = [replace(e, bandwidth=np.nan, objective=np.nan) for e in self.trace]
             self.trace += [replace(entry, syntheses=entry.syntheses + more)
                            for entry in trace[len(known) :]]  # fmt: skip
@@ -404,8 +417,8 @@ def _alone(
     record: _Record,
     own: TimeBudget,
     workers: Pool | None = None,
-) -> tuple[Any, dict[str, tuple[str, int]], list[TraceEntry], TimeBudget]:  # fmt: skip
-    """A search by a sampler of its own: what it finds, its units and trace, and what was left."""
+) -> _Done:  # fmt: skip
+    """A search by a sampler of its own."""
     with continued(own), SampleStore(path) as store, Workers(1) as one:
         sampler = Sampler(search.problem, store, workers or one)
         sampler.spent.add(record.units)
