@@ -33,7 +33,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
@@ -46,6 +46,7 @@ class MoveCheckOptions:
     lattice: int = 100  # plants
     fresh: int = 500  # plants drawn for the yield
     fresh_seed: int = 3000  # added to the problem's, so that no other draw is repeated
+    batch: int = 16  # plants that one worker simulates at a time
     steps: float = 10.0  # per duration of the setpoint: a continuous loop has 50 points in each
 
 
@@ -132,13 +133,23 @@ def exact_times(
 
 
 def latest_plant(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int
-) -> tuple[float, int, Array]:
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int,
+    workers: Pool | None = None, options: MoveCheckOptions = MoveCheckOptions(),
+) -> tuple[float, int, Array]:  # fmt: skip
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
-    uncertain = uncertain_plant(problem, theta)
-    points = lattice(uncertain, MoveCheckOptions.lattice, seed)
-    times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
+    points, size = lattice(uncertain_plant(problem, theta), options.lattice, seed), options.batch
+    parts = {i: (problem, theta, K, points[i : i + size]) for i in range(0, len(points), size)}
+    found = dict(results(workers, _times_at, parts))
+    times = np.concatenate([found[i] for i in parts])
     return float(times.max()), *points[int(times.argmax())]
+
+
+def _times_at(
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace,
+    points: Sequence[tuple[int, Array]],
+) -> Array:  # fmt: skip
+    plants = uncertain_plant(problem, theta).plants(points)
+    return exact_times(problem, motion_of(problem, theta), plants, K)
 
 
 def stated_time(

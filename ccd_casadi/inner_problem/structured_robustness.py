@@ -121,7 +121,7 @@ class DesignOnBox:
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = state_of(problem).seed + turn
-            time, option, point = latest_plant(problem, theta, design.controller, seed)
+            time, option, point = latest_plant(problem, theta, design.controller, seed, workers)
             late = f"{1e3 * time:.5g} ms" if np.isfinite(time) else "not settled"
             tell(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
             if time > value:
