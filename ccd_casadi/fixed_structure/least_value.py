@@ -14,7 +14,7 @@ but for that payment, `reward` dτ/dθ.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Protocol
@@ -63,7 +63,8 @@ class LeastValueOptions:
     reward: float = 1e-6  # of ln ω_b in ln v
     inside: float = 0.7  # of the ω_b that its bounds leave a given κ: from a bound a search crawls
     kept: float = 1.0 + 2e-6  # figure over bound that the search leaves
-    at_once: int = 2  # descents: none of them knows where the others end
+    at_once: int = 3  # descents: none of them knows where the others end
+    slowest: float = 1e-3  # of ω₀: the least bandwidth that is searched
 
 
 class Goal(Protocol):
@@ -184,6 +185,7 @@ def least_value(
     only_initial: bool = False,
     tell: Tell = silent,
     workers: Pool | None = None,
+    ended: Mapping[int, "Ended"] | None = None,
     options: LeastValueOptions = LeastValueOptions(),
 ) -> LeastValue:
     """Search the least value of a goal within the bounds, from a certified design.
@@ -203,6 +205,8 @@ def least_value(
         Is given a line for each end.
     workers : Pool, optional
         With it descents are made `options.at_once`, however many its processes are.
+    ended : mapping, optional
+        Results of `first_descents` from `initial`, by number, where they are known.
     options : LeastValueOptions
 
     Returns
@@ -221,8 +225,7 @@ def least_value(
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
     search = DesignSearch(problem, plants, sampling)
     w0 = problem.plants.omega_0
-    floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
-
+    floor = _floor(problem, least_bandwidth, options)
     descent = _Descent(problem, goal, options.reward, floor)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
@@ -245,15 +248,16 @@ def least_value(
             left.popleft()
             if bandwidth < least_bandwidth:
                 continue
-            begin = in_problem_units(problem, np.array(kappa))
-            tau = float(np.log(bandwidth / w0))
-            if np.isinf(tau):
-                own_tau = at_its_bandwidth(problem, begin).tau
-                tau = max(own_tau + float(np.log(options.inside)), floor)
-            begins.append(np.append(begin, tau))
+            if np.isinf(bandwidth):
+                begins.append(_begin(descent, kappa, options))
+            else:
+                begin = in_problem_units(problem, np.array(kappa))
+                begins.append(np.append(begin, np.log(bandwidth / w0)))
         if best.design is not design and ends_early("least-value start", len(begins)):
             break
-        if len(begins) == 1 and near is not None:
+        if ended is not None and len(begins) == len(ended):
+            ends, ended = dict(ended), None
+        elif len(begins) == 1 and near is not None:
             ends = {0: _descended(descent, begins[0], known, near)}
         else:
             tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
@@ -280,6 +284,48 @@ def least_value(
     return replace(best, steps=steps)
 
 
+def first_descents(
+    plants: Sequence[ScaledPlant],
+    structure: Structure,
+    bounds: Bounds,
+    goal: Goal,
+    initial: Sequence[Array],
+    *,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+    least_bandwidth: float = 0.0,
+    options: LeastValueOptions = LeastValueOptions(),
+) -> dict[int, Callable[[], "Ended"]]:
+    """List the descents that `least_value` begins with, for workers that have time before it.
+
+    Parameters
+    ----------
+    plants, structure, bounds, sampling, goal : as of `least_value`
+    initial : sequence of array (n,)
+        κ in SI of its first starts; those after `options.at_once` come later.
+    frequencies : tuple of two floats, optional
+        Bounds of K's roots, rad/s, as of its design.
+    least_bandwidth : float
+        rad/s.
+    options : LeastValueOptions
+
+    Returns
+    -------
+    dict of callable
+        By number, each without arguments; their results are `ended` of `least_value`.
+    """
+    problem = problem_for(plants, structure, bounds, sampling, frequencies)
+    floor = _floor(problem, least_bandwidth, options)
+    descent = _Descent(problem, goal, options.reward, floor)
+    begins = [_begin(descent, kappa, options) for kappa in initial[: options.at_once]]
+    return {i: partial(_descended, descent, x, ()) for i, x in enumerate(begins)}
+
+
+def _floor(problem: LoopProblem, least_bandwidth: float, options: LeastValueOptions) -> float:
+    """ln of the least bandwidth over ω₀."""
+    return float(np.log(max(least_bandwidth / problem.plants.omega_0, options.slowest)))
+
+
 @dataclass(frozen=True)
 class _Descent:
     """What a descent of a goal needs, in any process."""
@@ -296,9 +342,20 @@ class _Descent:
         return self.goal.at(own, workers)
 
 
+def _begin(descent: _Descent, kappa: Sequence[float] | Array, options: LeastValueOptions) -> Array:
+    """The start (n + 1,) with a controller: inside its bounds, at less than its bandwidth."""
+    begin = in_problem_units(descent.problem, np.asarray(kappa))
+    tau = at_its_bandwidth(descent.problem, begin).tau
+    return np.append(begin, max(tau + float(np.log(options.inside)), descent.floor))
+
+
+# The start as it is, the end, and how many loops were assessed; None of a start that is no use.
+Ended = tuple[Array | None, Iterate[Assessment] | None, int]
+
+
 def _descended(
     descent: _Descent, x: Array, known: Sequence[Array], workers: Pool | None = None
-) -> tuple[Array | None, Iterate[Assessment] | None, int]:
+) -> Ended:
     """From x to where steps no longer help, or come to what is known: the start as it is, the end,
     and how many loops were assessed; none of a start that is known or not stable."""
     scaled = partial(descent.scaled, workers=workers)
