@@ -193,7 +193,7 @@ def best_of_lists(
             founds = sampler.side_by_side([
                 IndependentSearch(
                     at if p.count == 1 else between, restricted(problem, p.lists), near(p),
-                    traced=p.count == 1, stored=judge is None or problem.figure is not BANDWIDTH,
+                    traced=p.count == 1,
                 )
                 for p in some
             ])  # fmt: skip

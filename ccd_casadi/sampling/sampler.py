@@ -6,7 +6,6 @@ end is stored whole (`kept`), with the controller, as it is made.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -37,6 +36,7 @@ from ccd_casadi.sampling.units import (
     timed,
 )
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Progress, remark
 from ccd_casadi.support.text import HZ
@@ -78,15 +78,12 @@ class IndependentSearch:
     given : object
     traced : bool
         As of `Sampler.of`.
-    stored : bool
-        Whether the store has what takes long in it, so that it soon is where another process was.
     """
 
     run: Callable[["Sampler", Any], Any]
     problem: CoDesignProblem
     given: Any
     traced: bool
-    stored: bool
 
 
 @dataclass(frozen=True)
@@ -97,10 +94,6 @@ class _Record:
     units: dict[str, tuple[str, int]]
     trace: tuple[TraceEntry, ...]
     bandwidth_at_start: float | None
-
-
-# What a search finds, its units and trace, and its budget with what was left.
-_Done = tuple[Any, dict[str, tuple[str, int]], list[TraceEntry], TimeBudget]
 
 
 class Sampler:
@@ -176,23 +169,18 @@ class Sampler:
         worker, on the same store.
 
         Each begins with the record of this run, and what it adds joins that in their order, so that
-        all is the same for any number of workers. All workers share the last one, which begins
-        again with what is `stored`. Those of a cluster have no such store: they share each.
+        all is the same for any number of workers. Those of a cluster have no such store: they share
+        each.
         """
         own, spent = budget(), self.spent
         record = _Record(spent.purpose, spent.units, tuple(self.trace), self.bandwidth_at_start)
         path = self.store.path.absolute()
         tasks = {i: (one, path, record, TimeBudget(own.minutes, own.began))
                  for i, one in enumerate(searches)}  # fmt: skip
-        done: dict[int, _Done] = {}
         if isinstance(self.workers, Workers):
-            with closing(results(self.workers, _alone, tasks)) as found:
-                for i, one in found:
-                    done[i] = one
-                    last = [search for j, search in enumerate(searches) if j not in done]
-                    if len(last) == 1 and last[0].stored and self.workers.count > 1:
-                        break  # which ends the worker that has it
-        done |= {i: _alone(*tasks[i], self.workers) for i in tasks if i not in done}
+            done = dict(results(self.workers, _alone, tasks))
+        else:
+            done = {i: _alone(*task, self.workers) for i, task in tasks.items()}
         before = spent.total
         for i, search in enumerate(searches):
             _, units, trace, left = done[i]
@@ -417,9 +405,9 @@ def _alone(
     record: _Record,
     own: TimeBudget,
     workers: Pool | None = None,
-) -> _Done:  # fmt: skip
-    """A search by a sampler of its own."""
-    with continued(own), SampleStore(path) as store, Workers(1) as one:
+) -> tuple[Any, dict[str, tuple[str, int]], list[TraceEntry], TimeBudget]:  # fmt: skip
+    """A search by a sampler of its own: what it finds, its units and trace, and what was left."""
+    with continued(own), SampleStore(path) as store, LentWorkers() as one:
         sampler = Sampler(search.problem, store, workers or one)
         sampler.spent.add(record.units)
         sampler.spent.purpose, sampler.whole = record.purpose, search.traced
