@@ -328,7 +328,7 @@ def test_a_run_is_of_the_value_that_was_chosen(listed_run: Path) -> None:
     assert result["fixed"] == {"m1": 57.0} == result["listed"]["chosen"]
     assert run.problem.names == ("m2",)
     assert run.problem.source.held == {"m1": 57.0}
-    assert any("m1 = 57 kg of 3" in words for words in result["notes"])
+    assert any("m1 = 57 kg (of 3 values)" in words for words in result["notes"])
     alone = problem_of(load_case(TWO_MASS))
     at_it = solve_problem(restricted(alone, {"m1": (57.0,)}), Lifted(points=24, box_points=4))
     assert result["objective"] == pytest.approx(at_it.result["objective"], rel=1e-6)
