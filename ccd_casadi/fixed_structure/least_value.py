@@ -50,6 +50,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
@@ -358,7 +359,7 @@ def _descended(
 ) -> Ended:
     """From x to where steps no longer help, or come to what is known: the start as it is, the end,
     and how many loops were assessed; none of a start that is known or not stable."""
-    scaled = partial(descent.scaled, workers=workers)
+    scaled = partial(descent.scaled, workers=workers or LentWorkers())  # the others may have ended
     model = LoopModel(descent.problem, scaled, descent.reward, descent.floor)
     model.known = list(known)
     start = model.at(x)
