@@ -165,8 +165,8 @@ class MoveTime:
                 gradient += weight * np.array(slopes)
         return float(np.log(value)), gradient / value
 
-    def to_theta(self, kappa: Array) -> Array:
-        """∂ ln v/∂θ at a fixed κ."""
+    def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
+        """∂ ln v/∂θ at a fixed κ; as `at`."""
         found, motion = self._crossings(np.asarray(kappa, float)), self.motion
         size = MotionOptions().complex_step
         step = 1j * size

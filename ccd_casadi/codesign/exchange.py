@@ -40,11 +40,11 @@ class ExchangeOptions:
     share : float
         Of the budget, after which no further exchange is tried.
     batch : int
-        Exchanges that are evaluated at once, per process: the best of them is taken.
+        Exchanges that are evaluated at once, by any number of workers: the best of them is taken.
     """
 
     share: float = 0.4
-    batch: int = 4
+    batch: int = 8
 
 
 def best_exchange(
@@ -74,7 +74,7 @@ def best_exchange(
         The best combination that was found, and how many were evaluated.
     """
     problem, keeps = sampler.problem, _keeps_constraints(sampler.problem)
-    size = options.batch * sampler.workers.count
+    size = options.batch
     tried = {tuple(begin.values())}
     count = 0
 

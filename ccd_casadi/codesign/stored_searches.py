@@ -124,7 +124,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
         The value at θ from its κ, or from warm starts where it has none.
     """
     problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
-    make = partial(structured_value, problem, best.theta)
+    make = partial(structured_value, problem, best.theta, sampler.workers)
     return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
 
 

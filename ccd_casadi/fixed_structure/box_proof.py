@@ -20,13 +20,13 @@ from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.break_points import SensorFamily
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.enclosure import LoopFamily
+from ccd_casadi.fixed_structure.enclosure import Enclosures, LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.process_pool import Pool, Workers, results
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,9 @@ class BoxProofOptions:
         Of actuators and sensors behind a hold, relative: or no proof.
     unit_frequency : float
         Over ω_b and the fastest pole: above it cells divide 1/ω.
+    shared : int
+        Boxes from which on two workers enclose half of them each: a call takes as long as a
+        thousand boxes.
     """
 
     slack: float = 1e-3
@@ -68,11 +71,12 @@ class BoxProofOptions:
     most_boxes_of_many: int = 250_000
     stuck_boxes_of_many: int = 45_000
     stuck_share: float = 0.25
-    batch: int = 2_000
+    batch: int = 4_000
     batches: int = 250
     decades: float = 6.0
     poles_apart: float = 1e-4
     unit_frequency: float = 3.0
+    shared: int = 2_000
 
 
 @dataclass(frozen=True)
@@ -104,15 +108,14 @@ class _Enclosed(Boxes):
 
 def divide_one(
     family: LoopFamily, box: Array, slack: float, most: int, enough: int,
-    options: BoxProofOptions = BoxProofOptions(),
+    options: BoxProofOptions = BoxProofOptions(), workers: Pool | None = None,
 ) -> Division:  # fmt: skip
     """Divide the box (2, n) of one option into up to `most`; `enough` where too many stay open."""
     part, known, spent = _initial_boxes(family, box, options.decades), np.array(np.inf), 0
     levels: dict[str, float] = {}
     waiting: _Enclosed | None = None
     while True:
-        with np.errstate(all="ignore"):  # of boxes that enclose nothing
-            found = family.enclose(part)
+        found = _enclosed(family, part, options.shared, workers)
         spent += len(part.chart)
         k, j = np.unravel_index(np.argmax(found.lowest), found.lowest.shape)
         if found.lowest[k, j] > 1.0 + slack:
@@ -132,6 +135,21 @@ def divide_one(
         first = min(options.batch, max(enough // options.batches, count // 4, 1))
         worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
         part, known = _halved(worst), np.tile(worst.highest, 2)
+
+
+def _enclosed(family: LoopFamily, boxes: Boxes, shared: int, workers: Pool | None) -> Enclosures:
+    """The figures on boxes, of many in two halves: the same by any number of workers."""
+    every = np.arange(len(boxes.chart))
+    parts = enumerate(np.array_split(every, 2 if len(every) >= shared else 1))
+    tasks = {i: (family, boxes.only(part)) for i, part in parts}
+    done = dict(results(workers, _enclosed_here, tasks))
+    names, *arrays = zip(*(vars(done[i]).values() for i in tasks), strict=True)
+    return Enclosures(names[0], *map(np.hstack, arrays))
+
+
+def _enclosed_here(family: LoopFamily, boxes: Boxes) -> Enclosures:
+    with np.errstate(all="ignore"):  # of boxes that enclose nothing
+        return family.enclose(boxes)
 
 
 def raised(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
@@ -364,7 +382,7 @@ def prove(
     slack, most_boxes : float, int, optional
         By default those of `options`.
     workers : Pool, optional
-        The options are spread over them.
+        The options are spread over them; of one option its boxes, unless they are a cluster.
     options : BoxProofOptions
 
     Returns
@@ -461,7 +479,8 @@ def divide(
     """
     enough = most if enough is None else enough
     longest_first = sorted(range(len(families)), key=lambda i: -len(families[i].plant.omega))
-    tasks = {i: (families[i], box, slack, most, enough, options) for i in longest_first}
+    near = workers if len(families) == 1 and isinstance(workers, Workers) else None
+    tasks = {i: (families[i], box, slack, most, enough, options, near) for i in longest_first}
     found = dict(results(workers, divide_one, tasks))
     names, levels = families[0].names, dict[str, float]()
     for option in range(len(families)):

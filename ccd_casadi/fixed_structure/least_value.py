@@ -14,7 +14,7 @@ but for that payment, `reward` dτ/dθ.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Protocol
@@ -50,6 +50,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.step import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
@@ -63,7 +64,8 @@ class LeastValueOptions:
     reward: float = 1e-6  # of ln ω_b in ln v
     inside: float = 0.7  # of the ω_b that its bounds leave a given κ: from a bound a search crawls
     kept: float = 1.0 + 2e-6  # figure over bound that the search leaves
-    at_once: int = 2  # descents: none of them knows where the others end
+    at_once: int = 3  # descents: none of them knows where the others end
+    slowest: float = 1e-3  # of ω₀: the least bandwidth that is searched
 
 
 class Goal(Protocol):
@@ -81,8 +83,8 @@ class Goal(Protocol):
         The plants may be spread over workers.
         """
 
-    def to_theta(self, kappa: Array) -> Array:
-        """∂ ln v/∂θ at a fixed κ."""
+    def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
+        """∂ ln v/∂θ at a fixed κ; as `at`."""
 
     def shown(self, value: float) -> str:
         """v with its unit."""
@@ -119,7 +121,7 @@ class RmsError:
         steps = 1j * COMPLEX_STEP * np.eye(len(kappa) + 1, len(kappa), -1)
         return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants), workers)
 
-    def to_theta(self, kappa: Array) -> Array:
+    def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
         step = 1j * COMPLEX_STEP
         moved = [
@@ -127,7 +129,7 @@ class RmsError:
              for dA, dB, dC in plant.changes_si()]
             for G, plant in ((plant.plant_si(), plant) for plant in self.plants)
         ]  # fmt: skip
-        return self._of_mean(np.asarray(kappa, complex)[None], moved)[1]
+        return self._of_mean(np.asarray(kappa, complex)[None], moved, workers)[1]
 
     def shown(self, value: float) -> str:
         return spoken(f"{1e9 * value:.4g} nm RMS")
@@ -184,6 +186,7 @@ def least_value(
     only_initial: bool = False,
     tell: Tell = silent,
     workers: Pool | None = None,
+    ended: Mapping[int, "Ended"] | None = None,
     options: LeastValueOptions = LeastValueOptions(),
 ) -> LeastValue:
     """Search the least value of a goal within the bounds, from a certified design.
@@ -203,6 +206,8 @@ def least_value(
         Is given a line for each end.
     workers : Pool, optional
         With it descents are made `options.at_once`, however many its processes are.
+    ended : mapping, optional
+        Results of `first_descents` from `initial`, by number, where they are known.
     options : LeastValueOptions
 
     Returns
@@ -221,12 +226,12 @@ def least_value(
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
     search = DesignSearch(problem, plants, sampling)
     w0 = problem.plants.omega_0
-    floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
-
+    floor = _floor(problem, least_bandwidth, options)
     descent = _Descent(problem, goal, options.reward, floor)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
-    first = float(np.exp(goal.at(design.kappa)[0]))
+    near = workers if isinstance(workers, Workers) else None  # a cluster is too far for a plant
+    first = float(np.exp(goal.at(design.kappa, near)[0]))
     best = LeastValue(design, first, first, 0, None)
     steps, known = 0, list[Array]()
     left = deque([*((np.inf, tuple(map(float, item))) for item in initial), own, *others])
@@ -244,16 +249,17 @@ def least_value(
             left.popleft()
             if bandwidth < least_bandwidth:
                 continue
-            begin = in_problem_units(problem, np.array(kappa))
-            tau = float(np.log(bandwidth / w0))
-            if np.isinf(tau):
-                own_tau = at_its_bandwidth(problem, begin).tau
-                tau = max(own_tau + float(np.log(options.inside)), floor)
-            begins.append(np.append(begin, tau))
+            if np.isinf(bandwidth):
+                begins.append(_begin(descent, kappa, options))
+            else:
+                begin = in_problem_units(problem, np.array(kappa))
+                begins.append(np.append(begin, np.log(bandwidth / w0)))
         if best.design is not design and ends_early("least-value start", len(begins)):
             break
-        if len(begins) == 1 and isinstance(workers, Workers):  # a cluster is too far for a plant
-            ends = {0: _descended(descent, begins[0], known, workers)}
+        if ended is not None and len(begins) == len(ended):
+            ends, ended = dict(ended), None
+        elif len(begins) == 1 and near is not None:
+            ends = {0: _descended(descent, begins[0], known, near)}
         else:
             tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
             ends = dict(results(workers, _descended, tasks))
@@ -271,12 +277,54 @@ def least_value(
             at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
             tell(f"{at}, {count} steps: {made.words}")
             if made.certified and value < best.value:
-                direct = goal.to_theta(made.kappa)
+                direct = goal.to_theta(made.kappa, near)
                 envelope = envelope_of(problem, end.x[:-1], conditions, direct)
                 if envelope is not None:
                     envelope = envelope.times(value)
                 best = replace(best, design=made, value=value, envelope=envelope)
     return replace(best, steps=steps)
+
+
+def first_descents(
+    plants: Sequence[ScaledPlant],
+    structure: Structure,
+    bounds: Bounds,
+    goal: Goal,
+    initial: Sequence[Array],
+    *,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+    least_bandwidth: float = 0.0,
+    options: LeastValueOptions = LeastValueOptions(),
+) -> dict[int, Callable[[], "Ended"]]:
+    """List the descents that `least_value` begins with, for workers that have time before it.
+
+    Parameters
+    ----------
+    plants, structure, bounds, sampling, goal : as of `least_value`
+    initial : sequence of array (n,)
+        κ in SI of its first starts; those after `options.at_once` come later.
+    frequencies : tuple of two floats, optional
+        Bounds of K's roots, rad/s, as of its design.
+    least_bandwidth : float
+        rad/s.
+    options : LeastValueOptions
+
+    Returns
+    -------
+    dict of callable
+        By number, each without arguments; their results are `ended` of `least_value`.
+    """
+    problem = problem_for(plants, structure, bounds, sampling, frequencies)
+    floor = _floor(problem, least_bandwidth, options)
+    descent = _Descent(problem, goal, options.reward, floor)
+    begins = [_begin(descent, kappa, options) for kappa in initial[: options.at_once]]
+    return {i: partial(_descended, descent, x, ()) for i, x in enumerate(begins)}
+
+
+def _floor(problem: LoopProblem, least_bandwidth: float, options: LeastValueOptions) -> float:
+    """ln of the least bandwidth over ω₀."""
+    return float(np.log(max(least_bandwidth / problem.plants.omega_0, options.slowest)))
 
 
 @dataclass(frozen=True)
@@ -295,12 +343,23 @@ class _Descent:
         return self.goal.at(own, workers)
 
 
+def _begin(descent: _Descent, kappa: Sequence[float] | Array, options: LeastValueOptions) -> Array:
+    """The start (n + 1,) with a controller: inside its bounds, at less than its bandwidth."""
+    begin = in_problem_units(descent.problem, np.asarray(kappa))
+    tau = at_its_bandwidth(descent.problem, begin).tau
+    return np.append(begin, max(tau + float(np.log(options.inside)), descent.floor))
+
+
+# The start as it is, the end, and how many loops were assessed; None of a start that is no use.
+Ended = tuple[Array | None, Iterate[Assessment] | None, int]
+
+
 def _descended(
     descent: _Descent, x: Array, known: Sequence[Array], workers: Pool | None = None
-) -> tuple[Array | None, Iterate[Assessment] | None, int]:
+) -> Ended:
     """From x to where steps no longer help, or come to what is known: the start as it is, the end,
     and how many loops were assessed; none of a start that is known or not stable."""
-    scaled = partial(descent.scaled, workers=workers)
+    scaled = partial(descent.scaled, workers=workers or LentWorkers())  # the others may have ended
     model = LoopModel(descent.problem, scaled, descent.reward, descent.floor)
     model.known = list(known)
     start = model.at(x)

@@ -36,7 +36,8 @@ class WorstPlantOptions:
         Of these points in all, at most: with many such parameters lines run through the models and
         evenly chosen corners of the rest.
     batch : int
-        Plants that are assessed together.
+        Plants that are assessed together: few, as a compass search moves to less than fifty, which
+        all workers share.
     few : int
         Parameters up to which every one is moved separately: a compass search.
     lattice, searches, rounds : int
@@ -57,7 +58,7 @@ class WorstPlantOptions:
     along: int = 61
     along_first: int = 16
     on_lines: int = 4000
-    batch: int = 48
+    batch: int = 8
     few: int = 4
     lattice: int = 200
     searches: int = 6

@@ -1,8 +1,9 @@
 """ω_b*(θ) of a fixed structure, with its envelope gradient, and the move of a design."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from operator import call
 
 import numpy as np
 
@@ -12,7 +13,14 @@ from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import SectionsDesign, SectionsOutcome, bandwidth_envelope
-from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
+from ccd_casadi.fixed_structure.least_value import (
+    Ended,
+    Goal,
+    LeastValue,
+    RmsError,
+    first_descents,
+    least_value,
+)
 from ccd_casadi.fixed_structure.local_search import Envelope, OptimalityOptions
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.worst_plant import lattice
@@ -33,7 +41,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
@@ -46,6 +54,7 @@ class MoveCheckOptions:
     lattice: int = 100  # plants
     fresh: int = 500  # plants drawn for the yield
     fresh_seed: int = 3000  # added to the problem's, so that no other draw is repeated
+    batch: int = 16  # plants that one worker simulates at a time
     steps: float = 10.0  # per duration of the setpoint: a continuous loop has 50 points in each
 
 
@@ -122,13 +131,23 @@ def exact_times(
 
 
 def latest_plant(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int
-) -> tuple[float, int, Array]:
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int,
+    workers: Pool | None = None, options: MoveCheckOptions = MoveCheckOptions(),
+) -> tuple[float, int, Array]:  # fmt: skip
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
-    uncertain = uncertain_plant(problem, theta)
-    points = lattice(uncertain, MoveCheckOptions.lattice, seed)
-    times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
+    points, size = lattice(uncertain_plant(problem, theta), options.lattice, seed), options.batch
+    parts = {i: (problem, theta, K, points[i : i + size]) for i in range(0, len(points), size)}
+    found = dict(results(workers, _times_at, parts))
+    times = np.concatenate([found[i] for i in parts])
     return float(times.max()), *points[int(times.argmax())]
+
+
+def _times_at(
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace,
+    points: Sequence[tuple[int, Array]],
+) -> Array:  # fmt: skip
+    plants = uncertain_plant(problem, theta).plants(points)
+    return exact_times(problem, motion_of(problem, theta), plants, K)
 
 
 def stated_time(
@@ -236,22 +255,46 @@ class ProblemAt:
         assert sampling is not None
         return MoveTime(tuple(self.plants), structure, sampling, motion_of(problem, self.theta))
 
+    @cached_property
+    def error_starts(self) -> list[Array]:
+        """The warm starts, κ in SI, of what is made small besides -ω_b."""
+        problem, bounds = self.problem, bounds_of(self.problem)
+        started = with_state(problem, warm_starts=state_of(problem).error_warm_starts)
+        return warm_starts_at(started, structure_of(problem), self.plants, bounds)
+
+    def searched_beside(
+        self, initial: Sequence[Array], workers: Pool
+    ) -> tuple[SectionsDesign, dict[int, Ended] | None]:
+        """As `searched`, while other workers make the first descents of `least`."""
+        problem, structured, structure = (
+            self.problem, structured_of(self.problem), structure_of(self.problem)
+        )  # fmt: skip
+        if problem.figure is BANDWIDTH or len(self.error_starts) < 2:
+            return self.searched(initial, workers=workers), None
+        assert isinstance(structure, Structure)
+        ends = first_descents(
+            self.plants, structure, bounds_of(problem), self.goal, self.error_starts,
+            sampling=structured.sampling, frequencies=structured.frequencies,
+            least_bandwidth=structured.bandwidth_least,
+        )  # fmt: skip
+        tasks = {-1: (partial(self.searched, initial),), **{i: (end,) for i, end in ends.items()}}
+        found = dict(results(workers, call, tasks))
+        return found.pop(-1), {i: found[i] for i in ends}
+
     def least(
         self,
         design: SectionsDesign,
         only_initial: bool = False,
         tell: Tell = silent,
         workers: Pool | None = None,
+        ended: Mapping[int, Ended] | None = None,
     ) -> LeastValue:
         """The least of the problem's figure from a certified design and its warm starts."""
         problem, structured = self.problem, structured_of(self.problem)
-        bounds = bounds_of(problem)
-        started = with_state(problem, warm_starts=state_of(problem).error_warm_starts)
         return least_value(
-            self.plants, bounds, design, self.goal, sampling=structured.sampling,
-            least_bandwidth=structured.bandwidth_least,
-            initial=warm_starts_at(started, structure_of(problem), self.plants, bounds),
-            only_initial=only_initial, tell=tell, workers=workers,
+            self.plants, bounds_of(problem), design, self.goal, sampling=structured.sampling,
+            least_bandwidth=structured.bandwidth_least, initial=self.error_starts,
+            only_initial=only_initial, tell=tell, workers=workers, ended=ended,
         )  # fmt: skip
 
     def value_of(
@@ -260,6 +303,7 @@ class ProblemAt:
         spent: int,
         only_initial: bool = False,
         workers: Pool | None = None,
+        ended: Mapping[int, Ended] | None = None,
     ) -> StructuredValue:
         """A design of largest bandwidth as a value of ω_b*(θ), or as a start to the least of
         another figure beside the warm starts; with `only_initial` where these lead to no certified
@@ -269,7 +313,7 @@ class ProblemAt:
         if problem.figure is not BANDWIDTH:
             design = too_slow(problem, design)
         if design.certified and problem.figure is not BANDWIDTH:
-            found = self.least(design, only_initial, workers=workers)
+            found = self.least(design, only_initial, workers=workers, ended=ended)
             design, error, envelope = found.design, found.value, found.envelope
         elif design.certified:
             bounds = bounds_of(problem)
@@ -301,17 +345,19 @@ def structured_value(
     here, starts = ProblemAt(problem, theta), structured_of(problem).starts
     initial = warm_starts_at(problem, structure_of(problem), here.plants, bounds_of(problem))
     made: SectionsDesign | None = None
+    ended: dict[int, Ended] | None = None
     spent = 0
-    if initial:
-        made = here.searched(initial, workers=workers)
+    if initial and workers is not None:
+        made, ended = here.searched_beside(initial, workers)
         spent += 1
-    if problem.figure is not BANDWIDTH and not (made and made.certified):
+    elif initial:
+        made = here.searched(initial)
+        spent += 1
+    lost = problem.figure is not BANDWIDTH and not (made and made.certified)
+    if lost and here.error_starts:
         # Controllers of least error meet every bound where those of most bandwidth may not.
-        started = with_state(problem, warm_starts=state_of(problem).error_warm_starts)
-        others = warm_starts_at(started, structure_of(problem), here.plants, bounds_of(problem))
-        if others:
-            made = here.searched(others, workers=workers)
-            spent += 1
+        made = here.searched(here.error_starts, workers=workers)
+        spent += 1
     if made is None or (starts and not made.certified):
         made = here.searched(initial, min(options.starts, starts), workers=workers)
         spent += 1
@@ -325,7 +371,7 @@ def structured_value(
         if not again.certified or again.bandwidth < kept:
             break
         made = again
-    return here.value_of(made, spent, only_initial=True, workers=workers)
+    return here.value_of(made, spent, only_initial=True, workers=workers, ended=ended)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:

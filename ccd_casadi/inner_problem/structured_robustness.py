@@ -39,7 +39,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, of_a_bound
 
@@ -121,7 +121,7 @@ class DesignOnBox:
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = state_of(problem).seed + turn
-            time, option, point = latest_plant(problem, theta, design.controller, seed)
+            time, option, point = latest_plant(problem, theta, design.controller, seed, workers)
             late = f"{1e3 * time:.5g} ms" if np.isfinite(time) else "not settled"
             tell(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
             if time > value:
@@ -132,11 +132,12 @@ class DesignOnBox:
         self, turns: range, workers: Pool, tell: Tell
     ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of several searches, and those to add of the first that finds any; as
-        many at a time as there are workers."""
+        many at a time as there are workers, which share one that is left over."""
         seen: list[Excess] = []
         for first in turns[:: workers.count]:
             own = range(first, min(first + workers.count, turns.stop))
-            found = dict(results(workers, self.worst, {turn: (turn,) for turn in own}))
+            inside = (silent, workers) if len(own) == 1 else ()
+            found = dict(results(workers, self.worst, {turn: (turn, *inside) for turn in own}))
             seen += [worst for worst, _ in found.values()]
             largest = max(seen, key=lambda one: one.value)
             tell(f"{of_a_bound(largest.value)} at most, searched from elsewhere")
@@ -239,9 +240,9 @@ class DesignOnBox:
         )  # fmt: skip
 
     def judged(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":
-        """On a lattice and by proof, at one time; of several options, whose proofs are spread over
-        the workers, one after the other."""
-        if structured_of(self.problem).uncertainty.options:
+        """On a lattice and by proof, one after the other, each spread over the workers; at one time
+        by those of a cluster, unless there are several options."""
+        if isinstance(workers, Workers) or structured_of(self.problem).uncertainty.options:
             return *self.on_lattice(worst, workers), self.proof(workers)
         tasks = {"proof": (self.proof,), "lattice": (self.on_lattice, worst)}
         found = dict(results(workers, call, tasks))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.inner_problem.searched_problem import with_warm_start
@@ -18,6 +19,7 @@ from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.units import InnerUnits, Retry, Theta, Unit, json_number
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool
 
 
@@ -136,6 +138,8 @@ class StructuredUnits(InnerUnits):
         self, problem: CoDesignProblem, problem_key: str, key: str, theta: Theta,
         workers: Pool | None = None,
     ) -> Unit:  # fmt: skip
+        if workers is None and problem.figure is BANDWIDTH:  # descents of others depend on a pool
+            workers = LentWorkers()
         value = structured_value(problem, theta, workers)
         design, judged = value.design, value.design.certificate
         peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]

@@ -3,6 +3,7 @@
 A task whose worker dies is tried once more, in a new one.
 """
 
+import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -16,6 +17,9 @@ from ccd_casadi.support import extensions
 from ccd_casadi.support.errors import UserError, raise_dropped
 from ccd_casadi.support.time_budget import InTime
 from ccd_casadi.support.worker_process import (
+    BACK,
+    LEND,
+    OFFER,
     R,
     T,
     WorkerLost,
@@ -131,16 +135,25 @@ class Workers(AbstractContextManager["Workers"]):
         self._mapping = True
         waiting, retried = deque(range(done_here, len(tasks))), set[int]()
         running: Running = {}
+        helping = _Helping()
         in_time = InTime(function)
         try:
             while waiting or running:
                 raise_dropped()
-                self._feed(in_time, tasks, waiting, running)
-                for pipe in connection.wait(list(running)):
+                self._feed(in_time, tasks, waiting, running, helping)
+                if not waiting:
+                    helping.offer(running, self.count)
+                for pipe in connection.wait([*running, *helping.busy]):
                     assert isinstance(pipe, connection.Connection)
+                    if pipe in helping.busy:
+                        self._end(helping.give_back(pipe))
+                        continue
                     worker, index = running[pipe]
                     try:
                         done, value = worker.answer()
+                        if done == LEND:
+                            helping.lend(worker, self._idle([*running, *helping.busy]), *value)
+                            continue
                     except WorkerLost:
                         code = worker.process.exitcode
                         self._end([worker])
@@ -156,29 +169,35 @@ class Workers(AbstractContextManager["Workers"]):
                         continue
                     # Only now: an interrupted answer leaves the worker among those to be ended.
                     del running[pipe]
-                    self._feed(in_time, tasks, waiting, running)
+                    self._feed(in_time, tasks, waiting, running, helping)
                     if not done:
                         raise value
                     yield value
         finally:
             self._mapping = False
             self._end([worker for worker, _ in running.values()])
+            self._end([helper for helper, _, _ in helping.busy.values()])
 
     def _feed(
-        self, function: Callable[[T], R], tasks: Sequence[T], waiting: deque[int], running: Running
-    ) -> None:
+        self, function: Callable[[T], R], tasks: Sequence[T], waiting: deque[int],
+        running: Running, helping: "_Helping",
+    ) -> None:  # fmt: skip
         """Give every idle worker a task, starting processes up to `count`."""
-        while waiting and len(running) < self.count:
-            idle = [worker for worker in self._workers if worker.pipe not in running]
-            dead = [worker for worker in idle if not worker.process.is_alive()]
-            self._end(dead)  # between two tasks: no task is to blame
-            if len(idle) == len(dead):
-                with interrupts_held():
-                    self._workers.append(WorkerProcess())
-                idle = self._workers[-1:]
-            worker, index = next(one for one in idle if one not in dead), waiting[0]
+        while waiting and len(running) + len(helping.busy) < self.count:
+            worker, index = self._idle([*running, *helping.busy]), waiting[0]
             running[worker.pipe] = (worker, waiting.popleft())
             worker.begin(function, tasks[index])
+
+    def _idle(self, busy: Sequence[connection.Connection]) -> WorkerProcess:
+        """A worker with nothing to do, started where there is none."""
+        idle = [worker for worker in self._workers if worker.pipe not in busy]
+        dead = [worker for worker in idle if not worker.process.is_alive()]
+        self._end(dead)  # between two tasks: no task is to blame
+        if len(idle) == len(dead):
+            with interrupts_held():
+                self._workers.append(WorkerProcess())
+            idle = self._workers[-1:]
+        return next(one for one in idle if one not in dead)
 
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():
@@ -186,6 +205,47 @@ class Workers(AbstractContextManager["Workers"]):
                 self._ended += worker.processor_seconds
                 worker.end()
                 self._workers.remove(worker)
+
+
+class _Helping:
+    """Idle workers that are offered to those at work on the last tasks of a map, and lent tasks.
+
+    A worker at work has one offer or one helper at most: else both ends of its pipe might wait to
+    be read.
+
+    `busy`: by the pipe of a helper itself, whom it helps and the number of its task; `offered`:
+    pipes of workers with an offer.
+    """
+
+    def __init__(self) -> None:
+        self.busy: dict[connection.Connection, tuple[WorkerProcess, WorkerProcess, int]] = {}
+        self.offered: set[connection.Connection] = set()
+
+    def offer(self, running: Running, count: int) -> None:
+        """Offer the workers that are idle."""
+        self.offered &= running.keys()
+        helped = {to.pipe for _, to, _ in self.busy.values()}
+        free = count - len(running) - len(self.busy) - len(self.offered)
+        alone = [pipe for pipe in running if pipe not in self.offered | helped]
+        for pipe in alone[: max(free, 0)]:
+            self.offered.add(pipe)
+            running[pipe][0].send(OFFER)
+
+    def lend(self, to: WorkerProcess, helper: WorkerProcess, number: int, payload: bytes) -> None:
+        """Let a helper go on with a task of a worker."""
+        self.offered.discard(to.pipe)
+        self.busy[helper.pipe] = (helper, to, number)
+        helper.send(payload)
+
+    def give_back(self, pipe: connection.Connection) -> list[WorkerProcess]:
+        """Send what a helper found to whom it helps; the helper, where it has died."""
+        helper, to, number = self.busy.pop(pipe)
+        try:
+            answer = pipe.recv_bytes()
+        except (EOFError, OSError):
+            answer = b""
+        to.send(BACK + pickle.dumps((number, answer)))
+        return [] if answer else [helper]
 
 
 def results(

@@ -66,6 +66,11 @@ class TimeBudget:
         """The end of a share of it, s of `time.monotonic`."""
         return self.began + share * 60.0 * self.minutes
 
+    def with_left_of(self, other: "TimeBudget") -> None:
+        """Note what a search of this budget has left in another process."""
+        self.left.update(other.left)
+        self.share = max(self.share, other.share)
+
     @property
     def ended(self) -> bool:
         """Whether it ended a search that would have gone on."""
@@ -84,7 +89,13 @@ _DEADLINE: ContextVar[float] = ContextVar("deadline", default=math.inf)
 
 
 def budget() -> TimeBudget:
-    """The budget of the search that is under way."""
+    """The budget of the search that is under way.
+
+    Returns
+    -------
+    TimeBudget
+        Without an end where none was set.
+    """
     return _BUDGET.get() or TimeBudget()
 
 
@@ -97,10 +108,21 @@ def within_budget(minutes: float | None) -> Iterator[TimeBudget]:
     minutes : float or None
     """
     made = TimeBudget(math.inf if minutes is None else minutes)
-    before = _BUDGET.set(made)
+    with continued(made), until(made.until(StageOptions.search)):
+        yield made
+
+
+@contextmanager
+def continued(own: TimeBudget) -> Iterator[None]:
+    """Within the block the budget is one that began elsewhere.
+
+    Parameters
+    ----------
+    own : TimeBudget
+    """
+    before = _BUDGET.set(own)
     try:
-        with until(made.until(StageOptions.search)):
-            yield made
+        yield
     finally:
         _BUDGET.reset(before)
 

@@ -199,8 +199,11 @@ class WorkerProcess:
 
     def begin(self, function: Callable[[T], object], task: T) -> None:
         """Let it go on with this task."""
-        message = pickle.dumps((function, task))
-        with suppress(OSError):  # it is dead: its answer will say so
+        self.send(pickle.dumps((function, task)))  # where it is dead its answer will say so
+
+    def send(self, message: bytes) -> None:
+        """Send a message as it is; nothing where it is dead."""
+        with suppress(OSError):
             self.pipe.send_bytes(message)
 
     def answer(
@@ -362,6 +365,58 @@ def tell(words: str) -> None:
         pipe.send_bytes(pickle.dumps((None, words)))
 
 
+LEND = "lend"  # what a worker answers that lends a task: its number and the pickled task follow
+OFFER, BACK = b"offer", b"back:"  # of an idle worker; what a lent task comes to
+
+
+class Offers:
+    """Idle workers that are offered to the task of this worker.
+
+    Attributes
+    ----------
+    count : int
+        Of idle workers.
+    back : dict
+        Number of a lent task -> its pickled answer; empty where its worker has died.
+    """
+
+    def __init__(self) -> None:
+        self.count, self.back, self._lent = 0, dict[int, bytes](), 0
+
+    def forget(self) -> None:
+        """Those of a task before."""
+        self.count, self.back = 0, {}
+
+    def heard(self, message: bytes) -> bool:
+        """Whether a message of the parent is no task."""
+        if message == OFFER:
+            self.count += 1
+        elif message.startswith(BACK):
+            number, answer = pickle.loads(message[len(BACK) :])  # of the parent
+            self.back[number] = answer
+        else:
+            return False
+        return True
+
+    def listen(self, wait: bool = False) -> None:
+        """Hear what the parent has said; `wait` for one message at least."""
+        for pipe in _to_parent:
+            while pipe.poll(None if wait else 0):
+                self.heard(pipe.recv_bytes())
+                wait = False
+
+    def lend(self, function: Callable[[T], object], task: T) -> int:
+        """Give a task to an idle worker; its number."""
+        self.count, self._lent = self.count - 1, self._lent + 1
+        payload = pickle.dumps((function, task))
+        for pipe in _to_parent:
+            pipe.send_bytes(pickle.dumps((LEND, (self._lent, payload))))
+        return self._lent
+
+
+offers = Offers()
+
+
 def _serve(pipe: connection.Connection) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends, even by SIGKILL in mid-task;
     Ctrl-C is the parent's."""
@@ -378,7 +433,10 @@ def _serve(pipe: connection.Connection) -> None:
     _to_parent.append(pipe)
     with suppress(EOFError, OSError):
         while True:
-            pipe.send_bytes(answer_message(pipe.recv_bytes()))
+            message = pipe.recv_bytes()
+            if not offers.heard(message):  # one of a task that has ended is of no use
+                offers.forget()
+                pipe.send_bytes(answer_message(message))
 
 
 def answer_message(message: bytes) -> bytes:

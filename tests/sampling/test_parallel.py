@@ -12,6 +12,7 @@ import pytest
 from oracles.busy import HANGS
 
 from ccd_casadi.support import worker_process
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost, import_ahead
@@ -62,6 +63,31 @@ def pid_and_sleep(task: tuple[str, float]) -> None:
     folder, seconds = task
     (Path(folder) / str(os.getpid())).touch()
     time.sleep(seconds)
+
+
+def where(task: tuple[int, str, bool]) -> tuple[int, int]:
+    """A number and its process; one that is not the owner's dies once, where it is to."""
+    value, owner, dying = task
+    mark = Path(owner)
+    if dying and str(os.getpid()) != mark.read_text():
+        mark.with_suffix(".died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value, os.getpid()
+
+
+def maps_itself(task: tuple[str, bool, int]) -> set[int]:
+    """The processes of maps inside a task, made until another one helps."""
+    folder, dying, last = task
+    owner = Path(folder) / f"owner {last}"
+    owner.write_text(str(os.getpid()))
+    limit, pids = time.monotonic() + HANGS, set[int]()
+    while last and len(pids) < 2 and not owner.with_suffix(".died").exists():
+        assert time.monotonic() < limit
+        tasks = [(i, str(owner), dying) for i in range(3)]
+        found = list(LentWorkers().map_unordered(where, tasks))
+        assert sorted(value for value, _ in found) == [0, 1, 2]
+        pids |= {pid for _, pid in found}
+    return pids
 
 
 @pytest.fixture(params=["spawned", "forked"])
@@ -175,6 +201,17 @@ def test_a_call_in_a_process_of_its_own_gives_its_result_or_what_went_wrong() ->
         with pytest.raises(Overrun, match="died"):
             runner.call(60.0, os._exit, 3)
         assert runner.call(60.0, square, 2) == 4
+
+
+@pytest.mark.parametrize("dying", [False, True])
+def test_an_idle_worker_helps_with_what_a_task_maps_over(tmp_path: Path, dying: bool) -> None:
+    """And where the helper dies the task is done by whom it helped."""
+    with Workers(2) as workers:
+        tasks = [(str(tmp_path), dying, last) for last in (0, 1)]
+        found = list(workers.map_unordered(maps_itself, tasks))
+        assert max(map(len, found)) == (1 if dying else 2)
+        assert (tmp_path / "owner 1.died").exists() == dying
+        assert sorted(workers.map_unordered(square, [1, 2, 3])) == [1, 4, 9]
 
 
 def test_an_abandoned_map_leaves_no_process() -> None:

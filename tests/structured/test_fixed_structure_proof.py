@@ -12,7 +12,7 @@ from oracles.helpers import HZ, two_mass_model
 from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
-from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome, prove
+from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, Proof, ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
@@ -25,6 +25,7 @@ from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Workers
 
 SYSTEM = mechanics(two_mass_model(), np.array([55.0, 55.0]))
 BOX = UncertainPlant(
@@ -76,6 +77,15 @@ def test_a_slack_of_zero_is_taken_as_it_is() -> None:
     """It was replaced by the default: a proof of more than was required."""
     proof = prove(BOX, STRUCTURE, KAPPA, 20.0 * HZ, BOUNDS, slack=0.0, most_boxes=1)
     assert proof.slack == 0.0
+
+
+def test_halves_of_the_boxes_enclosed_by_two_workers_prove_the_same() -> None:
+    bounds, bandwidth = tight(figures(LATE, BOX.corners(), BOUNDS), 1.02)
+    rest = BOX, STRUCTURE, KAPPA, bandwidth, bounds, LATE
+    whole = prove(*rest, most_boxes=3_000, options=BoxProofOptions(shared=10**6))
+    with Workers(2) as workers:
+        assert prove(*rest, most_boxes=3_000, workers=workers,
+                     options=BoxProofOptions(shared=2)) == whole  # fmt: skip
 
 
 @pytest.mark.parametrize("sampling", [None, FAST], ids=["continuous", "fast"])
