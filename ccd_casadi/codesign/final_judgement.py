@@ -128,7 +128,8 @@ def second_on_set(
     if judged is None or K is None:
         return NOT_COMPARED
     pairs = zip(plants_of_set(problem, theta), judged.plants, strict=True)
-    alike = problem.sampling is None and not problem.source.wiring  # its GS and the second's
+    wide = bool(problem.source.wiring or plant_of(problem).ports)
+    alike = problem.sampling is None and not wide  # its GS and the second's
     of_GS, bounds = ("GS",) if alike else (), kind_of(problem).bounds()
     return compared(
         (second_opinion(plant, K, problem.sampling, places=bounds.places),

@@ -89,8 +89,8 @@ class LoopDiscs:
         The n modes with and without hold and delay, as `discs_of` has them.
     m, r, g, e : array (N, n)
         Middles and radii of `held`, then of `free`; 0 where a box is not `good`.
-    c, b : array (n, p), (n, m)
-        The modes' directions of outputs and inputs.
+    c, b, f : array (n, p), (n, m), (n, q)
+        The modes' directions of outputs, inputs and disturbing forces.
     K : array (N, m, p)
         K_c.
     finite, good : array (n, N), (N,)
@@ -115,6 +115,7 @@ class LoopDiscs:
     e: Array
     c: Array
     b: Array
+    f: Array
     K: np.ndarray
     finite: np.ndarray
     good: np.ndarray
@@ -177,7 +178,7 @@ class LoopDiscs:
 
     def GS(self) -> FigureBounds:
         """Enclose ‖yM₂⁻¹G‖ by (17) to (19)."""
-        c, b, rows = self.c, self.b, self.terms.rows
+        c, b, rows = self.c, self.f, self.terms.rows
         G = (c.T * self.g[:, None]) @ b
         WG, by_all = self.W @ G, _lengths(c) * _lengths(b)
         rounding = GUARD * self.w * (np.abs(self.g) @ by_all)
@@ -288,10 +289,10 @@ class LoopFamily:
             (15)  ‖K_c T₁E M₂⁻¹‖ <= v = ε a₂(‖K_c‖ + k₁ max|y|)
             (16)  ‖K̂M₂⁻¹‖ <= (1 + ε)(k₁ + v) + ‖F‖a₂,
                   ‖K̂M₂⁻¹‖ >= (1 - ε)(‖K_c W‖ - kd - (k₁ - k) - v) - ‖F‖a₂
-            (17)  ‖M_d⁻¹G‖ <= h,   G in its discs, of radius e_i      `RankOneDiscs.largest`
+            (17)  ‖M_d⁻¹G‖ <= h,   G = Σ g_i c_i f_iᵀ, discs e_i      `RankOneDiscs.largest`
             (18)  ‖yM₂⁻¹G‖ <= max|y| h(1 + a₁δ)/(1 - q)
             (19)  ‖yM₂⁻¹G‖ >= (|y_c|(‖WG_c‖ - a d_G) - (δ_y + max|y| a₁δ)h)/(1 + q),
-                  d_G = Σ e_i |c_i| |b_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
+                  d_G = Σ e_i |c_i| |f_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
 
         by (15) K_c T₁ = K_c - yK_c M₁⁻¹, (16) M₂⁻¹ = M₁⁻¹ - T₁E M₂⁻¹, (18) yM₂⁻¹G =
         y(1 + T₁E)⁻¹(1 - M₁⁻¹(Δ_y + Δ_GK))M_d⁻¹G; each lower bound, k and h less or more the
@@ -378,8 +379,8 @@ class LoopFamily:
         u2 = u1 + q * y_max * a2  # (9)
         d = (r * _lengths(c) * _lengths(terms.rows)).sum(axis=1)  # (10)
         return LoopDiscs(
-            held, free, m, r, g, e, c, b, K, finite, good, y, y_max, delta_y, epsilon, grain, terms,
-            W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
+            held, free, m, r, g, e, c, b, self.plant.pushed, K, finite, good, y, y_max, delta_y,
+            epsilon, grain, terms, W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
         )  # fmt: skip
 
     def _at_rest(self, boxes: Boxes) -> Enclosures:
@@ -403,7 +404,7 @@ class LoopFamily:
             (5)  ‖(NM₂)⁻¹N‖ <= a₂ = n a₁/(1 - ε(1 + max|y| n a₁))
 
             ‖S‖ <= max|y| a₂,  ‖K̂S/y‖ <= ((1 + ε)‖K_c‖ + ‖F‖)a₂,  ‖T‖ <= 1 + ‖S‖,
-            ‖GS‖ <= max|y| a₂/n (‖G_R‖ + n‖G_F‖)
+            ‖GS‖ <= max|y| a₂/n (‖G_R‖ + n‖G_F‖), with f_i in the place of b_i
 
         Σ_R and Σ_F are sums over the free and the other modes.
         """
@@ -452,7 +453,7 @@ class LoopFamily:
             KS = ((1.0 + epsilon) * norm(K) + grain) * a2
             found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
         if compliance is not None:
-            G = (np.abs(g) + e) * _lengths(c) * _lengths(b)
+            G = (np.abs(g) + e) * _lengths(c) * _lengths(self.plant.pushed)
             NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
             GS = y_max * a2 / n * NG / (compliance * self._inside(boxes))
             found.append(("GS", GS, none))

@@ -22,7 +22,14 @@ from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, with_options
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    refuse_ports,
+    scaled_plant,
+    with_options,
+    with_ports,
+)
 from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
@@ -32,6 +39,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     with_structured,
 )
 from ccd_casadi.lti.ports import BreakPoint
+from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -196,8 +204,43 @@ def nearby(
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
-    given = structured_of(problem).uncertainty.options
-    return [with_options(problem, options) for options in ((), *given)]
+    """The problem with every option set; with its ports where their compliance is bounded."""
+    structured = structured_of(problem)
+    if structured.compliance_max is not None and plant_of(problem).ports:
+        problem = with_ports(problem)
+    return [with_options(problem, options) for options in ((), *structured.uncertainty.options)]
+
+
+def _own_ports(problem: CoDesignProblem) -> OwnPorts | None:
+    """Of plants that `_options` has with their ports."""
+    wide, source = _options(problem)[0], problem.source
+    if source.wide or not wide.source.wide:
+        return None
+    narrow = plant_of(problem)
+    return OwnPorts(narrow.outputs, narrow.inputs, narrow.inputs * bool(source.wiring.actuator))
+
+
+def require_bounded_ports(problem: CoDesignProblem) -> None:
+    """Refuse a bound of the compliance between ports whose loop is of several outputs, or of
+    several forces and several errors at once.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Raises
+    ------
+    PlantError
+        It is; singular values of the compliance cross where it has several.
+    """
+    if (own := _own_ports(problem)) is None:
+        return
+    if own.outputs > 1 or own.inputs > 1:
+        refuse_ports(problem, "inner.compliance_max of several sensors or actuators")
+    wide = plant_of(_options(problem)[0])
+    forces, errors = wide.inputs - own.inputs, wide.outputs - own.outputs - own.forces
+    if min(forces, errors) > 1:
+        refuse_ports(problem, "inner.compliance_max of several forces and several errors at once")
 
 
 @dataclass(frozen=True)
@@ -225,8 +268,10 @@ class Ranged:
         evaluate, x = self.wider[option].evaluate, ca.SX.sym("x", count)
         if not isinstance(evaluate, FromExpressions):
             return None
-        theta = ca.vertcat(*self.theta, x)
-        return ca.Function("graph", [x], evaluate.matrices.call([theta])[:5])
+        M, D, K, B, C = evaluate.matrices.call([ca.vertcat(*self.theta, x)])[:5]
+        if (own := _own_ports(self.problem)) is not None:
+            B, C = B[:, : own.inputs], C[: own.outputs, :]
+        return ca.Function("graph", [x], [M, D, K, B, C])
 
 
 def uncertain_plant(
@@ -251,7 +296,7 @@ def uncertain_plant(
         problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges),
         own.along, own.graph,
-        problem.suspension.rigid_modes,
+        problem.suspension.rigid_modes, _own_ports(problem),
     )  # fmt: skip
 
 
