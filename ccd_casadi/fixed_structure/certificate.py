@@ -284,7 +284,7 @@ def judged(
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values, options.curves)
     beyond_half_the_rate = np.zeros(len(good))
-    if table.free is not None and bounds.compliance_max is not None:
+    if table.period is not None and table.free is not None and bounds.compliance_max is not None:
         beyond, at = _compliance_beyond(table, [free[i] for i in good], options)
         larger = beyond > tops["GS"][0]
         tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]

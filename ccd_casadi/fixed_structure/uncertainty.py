@@ -93,11 +93,7 @@ class UncertainPlant:
     def encloses_forces(self) -> bool:
         """Whether what forces move is enclosed over the box: one mode after the other as the loop
         has them, at its output, of modes that do not move."""
-        own, model = self.own, self.options[0]
-        if own is None:
-            return True
-        alike = len(model.C) == own.outputs and not model.wiring
-        return alike and not self.ranges
+        return self.own is None or not (self.own.counted or self.ranges)
 
     @property
     def _free(self) -> Suspension:

@@ -204,20 +204,32 @@ def nearby(
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
-    """The problem with every option set; with its ports where their compliance is bounded."""
-    structured = structured_of(problem)
-    if structured.compliance_max is not None and plant_of(problem).ports:
-        problem = with_ports(problem)
-    return [with_options(problem, options) for options in ((), *structured.uncertainty.options)]
+    """The problem with every option set, with its ports where they are bounded."""
+    given, (wide, _) = structured_of(problem).uncertainty.options, bounded_ports(problem)
+    return [with_options(wide, options) for options in ((), *given)]
 
 
-def _own_ports(problem: CoDesignProblem) -> OwnPorts | None:
-    """Of plants that `_options` has with their ports."""
-    wide, source = _options(problem)[0], problem.source
-    if source.wide or not wide.source.wide:
-        return None
-    narrow = plant_of(problem)
-    return OwnPorts(narrow.outputs, narrow.inputs, narrow.inputs * bool(source.wiring.actuator))
+def bounded_ports(problem: CoDesignProblem) -> tuple[CoDesignProblem, OwnPorts | None]:
+    """Give a problem's plant its ports where the compliance between them is bounded.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    wide : CoDesignProblem
+        Of `with_ports`; the problem itself where its compliance has no bound or it has no ports.
+    own : OwnPorts or None
+        Which inputs and outputs of its plant are those of the problem's; None: all.
+    """
+    source, narrow = problem.source, plant_of(problem)
+    if source.wide or structured_of(problem).compliance_max is None or not narrow.ports:
+        return problem, None
+    wide, counted = with_ports(problem), 0
+    if "performance" in narrow.ports or source.wiring.sensor:
+        counted = plant_of(wide).outputs - narrow.outputs
+    return wide, OwnPorts(narrow.outputs, narrow.inputs, counted)
 
 
 def require_bounded_ports(problem: CoDesignProblem) -> None:
@@ -233,13 +245,12 @@ def require_bounded_ports(problem: CoDesignProblem) -> None:
     PlantError
         It is; singular values of the compliance cross where it has several.
     """
-    if (own := _own_ports(problem)) is None:
+    whole, own = bounded_ports(problem)
+    if own is None:
         return
     if own.outputs > 1 or own.inputs > 1:
         refuse_ports(problem, "inner.compliance_max of several sensors or actuators")
-    wide = plant_of(_options(problem)[0])
-    forces, errors = wide.inputs - own.inputs, wide.outputs - own.outputs - own.forces
-    if min(forces, errors) > 1:
+    if min(plant_of(whole).inputs - own.inputs, own.counted) > 1:
         refuse_ports(problem, "inner.compliance_max of several forces and several errors at once")
 
 
@@ -269,7 +280,7 @@ class Ranged:
         if not isinstance(evaluate, FromExpressions):
             return None
         M, D, K, B, C = evaluate.matrices.call([ca.vertcat(*self.theta, x)])[:5]
-        if (own := _own_ports(self.problem)) is not None:
+        if (own := bounded_ports(self.problem)[1]) is not None:
             B, C = B[:, : own.inputs], C[: own.outputs, :]
         return ca.Function("graph", [x], [M, D, K, B, C])
 
@@ -296,7 +307,7 @@ def uncertain_plant(
         problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges),
         own.along, own.graph,
-        problem.suspension.rigid_modes, _own_ports(problem),
+        problem.suspension.rigid_modes, bounded_ports(problem)[1],
     )  # fmt: skip
 
 

@@ -65,15 +65,14 @@ class OwnPorts:
     Attributes
     ----------
     outputs, inputs : int
-        p and m. Further inputs are disturbing forces (none: those of the actuators), further
-        outputs what counts (none: the sensors).
-    forces : int
-        How many of the last outputs are the actuators' forces.
+        p and m. Further inputs are disturbing forces (none: those of the actuators).
+    counted : int
+        Outputs after these that count; 0: the sensors', and S moves with a force as they do.
     """
 
     outputs: int
     inputs: int
-    forces: int = 0
+    counted: int = 0
 
     def drives(self, B: Array) -> tuple[Array, Array]:
         """Columns (..., n, m) of u and (..., n, q) of disturbing forces."""
@@ -82,13 +81,13 @@ class OwnPorts:
 
     def readings(self, C: Array) -> tuple[Array, Array]:
         """Rows (..., p, n) of the sensors, and these with what counts below (..., p + z, n)."""
-        return C[..., : self.outputs, :], C[..., : C.shape[-2] - self.forces, :]
+        return C[..., : self.outputs, :], C[..., : self.outputs + self.counted, :]
 
     def apart(self, plant: StateSpace) -> ForcedPlant:
         """A wide plant as what u moves, and beside it what disturbing forces move."""
         (B, E), (C, whole) = self.drives(plant.B), self.readings(plant.C)
         moved = strictly_proper(plant.A, E, whole)
-        counted = None if len(C) == len(whole) else strictly_proper(plant.A, B, whole)
+        counted = strictly_proper(plant.A, B, whole) if self.counted else None
         return ForcedPlant.of(strictly_proper(plant.A, B, C), moved, counted)
 
 

@@ -352,7 +352,7 @@ def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
     (B, E), (C, whole) = own.drives(wide.B), own.readings(wide.C)
     (dB, dE), (dC, dwhole) = own.drives(wide.dB), own.readings(wide.dC)
     moved = replace(wide, B=E, C=whole, dB=dE, dC=dwhole)
-    counted = replace(moved, B=B, dB=dB) if len(whole) > len(C) else None
+    counted = replace(moved, B=B, dB=dB) if own.counted else None
     return replace(wide, B=B, C=C, dB=dB, dC=dC, mechanics=moved, counted=counted)
 
 
