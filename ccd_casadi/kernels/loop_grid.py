@@ -204,7 +204,7 @@ def second(curve, number, which, v, loop):
     """
     at, of, g, sigma = room(loop)
     factors, values, channel, into, out, terms, residues, T, delay = loop[:9]
-    _, own, kinds, free, levers = loop[9:]
+    _, own, kinds, free, lever = loop[9:]
     (m, c), p, n, q = into.shape, out.shape[1], g.size, free[1].shape[4]
     z = np.complex128
     bends, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
@@ -217,14 +217,15 @@ def second(curve, number, which, v, loop):
         if curve[j] == LoopCurve.GS:
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
-        lever = levers[which[j]]
-        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, q, lever, at, of, sigma)
+        σ, place = gain_of(
+            curve[j], number[j], into, out, own, kinds, q, lever, which[j], at, of, sigma
+        )
         kind = broken(curve[j], number[j], p, kinds)
         columns = q if curve[j] == LoopCurve.GS else p
         if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1
-        _by_channel(curve[j], number[j], kind, place, into, out, own, q, lever, at, of, crossed,
-                    moved, back, ahead)  # fmt: skip
+        _by_channel(curve[j], number[j], kind, place, into, out, own, q, lever, which[j], at, of,
+                    crossed, moved, back, ahead)  # fmt: skip
         second_slopes(factors, g, bend)
         for a in range(n):
             i = channel[a]
@@ -255,15 +256,15 @@ def _over_gap(σ, other):
 
 
 @inlined
-def _by_channel(curve, number, kind, place, into, out, own, forces, lever, at, of, crossed, moved,
-                back, ahead):  # fmt: skip
+def _by_channel(curve, number, kind, place, into, out, own, forces, lever, of_plant, at, of,
+                crossed, moved, back, ahead):  # fmt: skip
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
     (m, c), p, at_actuator = into.shape, out.shape[1], kind == GainOf.ACTUATOR
     shared = m == 1 and p > 1
     one = over_one_plus_L(out, of[K], at) if shared else 1.0 + 0.0j
-    of_force, counted = curve == LoopCurve.KS or at_actuator, lever.shape[0]
+    of_force, counted = curve == LoopCurve.KS or at_actuator, lever.shape[1]
     rows, columns = m if of_force else p, forces if curve == LoopCurve.GS else p
     levered = curve == LoopCurve.GS and counted > 0
     if levered:
@@ -290,7 +291,7 @@ def _by_channel(curve, number, kind, place, into, out, own, forces, lever, at, o
             elif levered:
                 for b in range(p):
                     for d in range(p):
-                        P[a, i] -= lever[a, d] * at[S, d, b] * at[GV, b, i]
+                        P[a, i] -= lever[of_plant, a, d] * at[S, d, b] * at[GV, b, i]
                 for b in range(m):
                     P[a, i] -= at[G, p + a, b] * into[b, i]
                     for h in range(c):

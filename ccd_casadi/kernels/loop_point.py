@@ -131,41 +131,9 @@ def closed(into, out, k, at):
 
 
 @compiled
-def moved(into, out, k, q, lever, at):
-    """Fills M with what q forces move, S G₀, or of z errors H y + N x
-
-        H S G₀ + N₀ - N K S G₀
-
-    of which each term is as large as the sum towards 0 Hz, where G₀ alone is not; its rows.
-    """
-    (m, c), p, z = into.shape, out.shape[1], lever.shape[0]
-    for b in range(q):
-        for a in range(max(p, z)):
-            total = 0.0j
-            if z == 0:
-                for d in range(p):
-                    total += at[S, a, d] * at[FREE, d, b]
-            elif a < z:
-                total = at[FREE, p + a, b]
-                for d in range(p):
-                    for e in range(p):
-                        total += lever[a, d] * at[S, d, e] * at[FREE, e, b]
-                for i in range(c):
-                    force = 0.0j
-                    for d in range(p):
-                        force += k[i] * at[US, i, d] * at[FREE, d, b]
-                    for e in range(m):
-                        total -= at[G, p + a, e] * into[e, i] * force
-            at[M, a, b] = total
-    return p if z == 0 else z
-
-
-@compiled
-def matrix(curve, into, out, k, q, lever, at):
-    """Fills M of a curve; its rows and columns."""
+def matrix(curve, into, out, k, q, at):
+    """Fills M of a curve, S G₀ of q forces; its rows and columns."""
     (m, c), p = into.shape, out.shape[1]
-    if curve == LoopCurve.GS:
-        return moved(into, out, k, q, lever, at), q
     if curve == LoopCurve.KS:
         for b in range(p):
             for a in range(m):
@@ -174,16 +142,45 @@ def matrix(curve, into, out, k, q, lever, at):
                     total += into[a, i] * (k[i] * at[US, i, b])
                 at[M, a, b] = total
         return m, p
+    columns = q if curve == LoopCurve.GS else p
     for a in range(p):
-        for b in range(p):
+        for b in range(columns):
             total = 0.0j
-            if curve == LoopCurve.T:
+            if curve == LoopCurve.GS:
+                for d in range(p):
+                    total += at[S, a, d] * at[FREE, d, b]
+            elif curve == LoopCurve.T:
                 for d in range(p):
                     total += at[GK, a, d] * at[S, d, b]
             else:
                 total = at[S, a, b]
             at[M, a, b] = total
-    return p, p
+    return p, columns
+
+
+@compiled
+def moved(into, out, k, q, lever, of_plant, at):
+    """Fills M with what q forces move of z errors H y + N x
+
+        H S G₀ + N₀ - N K S G₀
+
+    of which each term is as large as the sum towards 0 Hz, where G₀ alone is not; z and q.
+    """
+    (m, c), p, z = into.shape, out.shape[1], lever.shape[1]
+    for b in range(q):
+        for a in range(z):
+            total = at[FREE, p + a, b]
+            for d in range(p):
+                for e in range(p):
+                    total += lever[of_plant, a, d] * at[S, d, e] * at[FREE, e, b]
+            for i in range(c):
+                force = 0.0j
+                for d in range(p):
+                    force += k[i] * at[US, i, d] * at[FREE, d, b]
+                for e in range(m):
+                    total -= at[G, p + a, e] * into[e, i] * force
+            at[M, a, b] = total
+    return z, q
 
 
 @compiled
@@ -209,7 +206,7 @@ def broken(curve, number, p, kinds):
 
 
 @compiled
-def own_gain(curve, i, into, out, k, own, kinds, q, lever, at):
+def own_gain(curve, i, into, out, k, own, kinds, q, at):
     """Gain of channel i's own; its row is in M's first row, of one place its entry."""
     (m, c), p = into.shape, out.shape[1]
     kind = broken(curve, p + i, p, kinds)
@@ -227,7 +224,7 @@ def own_gain(curve, i, into, out, k, own, kinds, q, lever, at):
             at[M, 0, 0] = over_one_plus_L(out, k, at)
         rows, columns = m, m
     else:
-        rows, columns = matrix(curve, into, out, k, q, lever, at)
+        rows, columns = matrix(curve, into, out, k, q, at)
     of_force = int(curve == LoopCurve.KS or kind == GainOf.ACTUATOR)
     length = row_of(own[of_force, i], at[M], rows, columns)
     if kind == GainOf.ROW:
@@ -240,21 +237,23 @@ def own_gain(curve, i, into, out, k, own, kinds, q, lever, at):
 
 
 @compiled
-def gain_of(curve, number, into, out, own, kinds, q, lever, at, of, sigma):
+def gain_of(curve, number, into, out, own, kinds, q, lever, of_plant, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
-    (m, c), p, z = into.shape, out.shape[1], lever.shape[0]
+    (m, c), p, z = into.shape, out.shape[1], lever.shape[1]
     kind, place = broken(curve, number, p, kinds), number
     columns = q if curve == LoopCurve.GS else p
     rows = m if curve == LoopCurve.KS else p
     levered = curve == LoopCurve.GS and z > 0
     if levered:
         rows = z
-    if number < p:
-        matrix(curve, into, out, of[K], q, lever, at)
+        moved(into, out, of[K], q, lever, of_plant, at)
+        singular(at[M], rows, columns, at[V], sigma, True)
+    elif number < p:
+        matrix(curve, into, out, of[K], q, at)
         singular(at[M], rows, columns, at[V], sigma, True)
     else:
         place = 0
-        size = own_gain(curve, number - p, into, out, of[K], own, kinds, q, lever, at)
+        size = own_gain(curve, number - p, into, out, of[K], own, kinds, q, at)
         if kind == GainOf.ROW:
             singular(at[M], 1, columns, at[V], sigma, True)
         else:
@@ -274,10 +273,11 @@ def gain_of(curve, number, into, out, own, kinds, q, lever, at, of, sigma):
             of[U, a] = row * at[M, 0, 0].conjugate() * scale
     for a in range(p):
         of[SEEN, a] = of[U, a]
-        if levered:
+    if levered:
+        for a in range(p):
             of[SEEN, a] = 0.0j
             for b in range(z):
-                of[SEEN, a] += of[U, b] * lever[b, a]
+                of[SEEN, a] += of[U, b] * lever[of_plant, b, a]
     for a in range(p):
         total = 0.0j
         if curve == LoopCurve.GS:
@@ -368,13 +368,12 @@ def levels(curves, which, v, loop, least, answers):
     terms, residues, T, d = loop.terms, loop.residues, loop.period, loop.delay
     limits, own, places = loop.limits, loop.rows, answers.place
     free_terms, free_residues = loop.free
-    q = free_residues.shape[4]
+    q, lever, levered = free_residues.shape[4], loop.lever, loop.lever.shape[1] > 0
     k, matrix_room, vectors = of[K], at[M], at[V]
     p, numbers, m = outputs.shape[1], limits.shape[1], into.shape[0]
     out = np.full((count, most, curves.shape[1], numbers), -np.inf)
     sensitivity = np.empty(p)
     for i in range(count):
-        lever = loop.lever[which[i]]
         for j in range(most):
             ω, chain = warped(T, v[i, j])
             gains(factors, values, complex(0.0, v[i, j]), k)
@@ -397,7 +396,10 @@ def levels(curves, which, v, loop, least, answers):
                     response(free_terms, free_residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
                 rows, columns, top = p, p, height
                 if not of_s or np.isnan(height):
-                    rows, columns = matrix(curve, into, outputs, k, q, lever, at)
+                    if curve == LoopCurve.GS and levered:
+                        rows, columns = moved(into, outputs, k, q, lever, which[i], at)
+                    else:
+                        rows, columns = matrix(curve, into, outputs, k, q, at)
                     top = abs(at[M, 0, 0])
                     if rows + columns > 2:
                         top = largest_gain(matrix_room, rows, columns)
@@ -408,7 +410,10 @@ def levels(curves, which, v, loop, least, answers):
                     out[i, j, c, 0] = top + level
                 elif top + level > least:
                     if not (of_s and known):
-                        matrix(curve, into, outputs, k, q, lever, at)
+                        if curve == LoopCurve.GS and levered:
+                            moved(into, outputs, k, q, lever, which[i], at)
+                        else:
+                            matrix(curve, into, outputs, k, q, at)
                         singular(matrix_room, rows, columns, vectors, sigma, False)
                     for number in range(p):
                         if of_s and not known:
@@ -418,9 +423,7 @@ def levels(curves, which, v, loop, least, answers):
                     known = known or of_s
                 for number in range(p, numbers):
                     if limits[curve, number] < np.inf:
-                        size = own_gain(
-                            curve, number - p, into, outputs, k, own, loop.kinds, q, lever, at
-                        )
+                        size = own_gain(curve, number - p, into, outputs, k, own, loop.kinds, q, at)
                         level = offset(curve, number, ω, chain, limits)[0]
                         out[i, j, c, number] = np.log(size) + level
     return out
@@ -450,9 +453,9 @@ def rows(curve, number, which, v, loop):
     at, of, g, sigma = room(loop)
     # Unpacked once: to hand all of them to a function costs as much as a row.
     factors, values, channel, into, out, terms, residues, T, delay = loop[:9]
-    limits, own, kinds, free, levers = loop[9:]
+    limits, own, kinds, free, lever = loop[9:]
     count, (m, c), p, q = v.size, into.shape, out.shape[1], free[1].shape[4]
-    wide = p + levers.shape[1]
+    wide = p + lever.shape[1]
     value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
     x, y = np.empty((count, wide), np.complex128), np.empty((count, m), np.complex128)
     w = np.zeros((count, q), np.complex128)
@@ -465,8 +468,9 @@ def rows(curve, number, which, v, loop):
             closed(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
-        lever = levers[which[j]]
-        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, q, lever, at, of, sigma)
+        σ, place = gain_of(
+            curve[j], number[j], into, out, own, kinds, q, lever, which[j], at, of, sigma
+        )
         level, rise = offset(curve[j], number[j], ω, chain, limits)
         for i in range(c):
             rise += (of[SHARE, i] * of[RATE, i]).real
