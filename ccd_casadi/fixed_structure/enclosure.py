@@ -21,6 +21,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, FrequencyAxis, axis_of, gain_of
 from ccd_casadi.fixed_structure.discs import GUARD, Discs, RankOneDiscs, discs_of, norm
+from ccd_casadi.fixed_structure.force_discs import ForceDiscs
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
@@ -331,16 +332,17 @@ class LoopFamily:
             figures["KS"] = loop.KS()
             found += self._weighted(boxes, level, figures["KS"][:2], figures["T"][:2])
         if compliance is not None:
-            figures["GS"] = loop.GS()
+            elsewhere = self.plant.counted is not None
+            figures["GS"] = self._moved(loop) if elsewhere else loop.GS()
             upper, lower, *_ = figures["GS"]
-            limit = compliance * self._inside(boxes)
+            limit = self._inside(boxes) * (1.0 if elsewhere else compliance)
             found.append(("GS", upper / limit, lower / limit))
         names, most_at, least_at = zip(*found, strict=True)
         highest, lowest = np.array(most_at), np.array(least_at)
         highest = np.where(loop.good & ~np.isnan(highest), highest, np.inf)
         lowest = np.where(loop.good & np.isfinite(lowest), lowest, 0.0)
         of = np.array([name if name in figures else "S" for name in names])
-        several = figures if len(self.outputs) > 1 else {}
+        several = figures if len(self.outputs) > 1 or self.plant.counted is not None else {}
         spread = loop.spread(of[np.argmax(highest, axis=0)], several)
         return Enclosures(names, highest, lowest, spread, loop.good)
 
@@ -383,6 +385,28 @@ class LoopFamily:
             epsilon, grain, terms, W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
         )  # fmt: skip
 
+    def _moved(self, loop: LoopDiscs) -> FigureBounds:
+        """Enclose what a force moves over its bound, where not the sensor counts."""
+        of_gain = loop.epsilon * np.abs(loop.K[:, 0, 0]) + loop.grain
+        y = loop.y, loop.y_max, loop.delta_y
+        return FigureBounds(
+            *self._force_discs((loop.m, loop.r, loop.g, loop.e), loop.K, of_gain, y, None)
+        )
+
+    def _force_discs(
+        self, modes: tuple[np.ndarray, ...], K: np.ndarray, of_gain: Array,
+        y: tuple[np.ndarray, Array, Array], at_rest: Array | None,
+    ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+        """`ForceDiscs.enclosed` of modes (m, r, g, e), K̂ and y."""
+        m, r, g, e = modes
+        plant, alike = self.plant, self.period is None and not self.low_pass
+        assert plant.counted is not None
+        assert self.bounds.compliance_max is not None
+        numbers = ForceDiscs(m, r, g, e, alike, K[:, 0, 0], of_gain, y[0], y[2], at_rest,
+                             plant.rigid)  # fmt: skip
+        z = plant.counted / self.bounds.compliance_max
+        return numbers.enclosed(plant.reading[:, 0], plant.drive[:, 0], z, plant.pushed)
+
     def _at_rest(self, boxes: Boxes) -> Enclosures:
         """The same, upper bounds alone, on boxes at rest, of a plant with free bodies.
 
@@ -424,6 +448,7 @@ class LoopFamily:
         mu = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
         good &= mu > 0.0
         mu = np.where(good, mu, 1.0)
+        m_y, r_y, g_y, e_y = (part.copy() for part in (m, r, g, e))
         for part in (m, r, g, e):  # from here on those of G_R
             part[:, rigid] /= mu[:, None]
         q = axis.y.size**2 / mu
@@ -452,7 +477,12 @@ class LoopFamily:
         if level is not None:
             KS = ((1.0 + epsilon) * norm(K) + grain) * a2
             found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
-        if compliance is not None:
+        if compliance is not None and self.plant.counted is not None:
+            y_most = axis.y.size**2
+            grain_of = epsilon * np.abs(K[:, 0, 0]) + grain
+            most, *_ = self._force_discs((m_y, r_y, g_y, e_y), K, grain_of, self._y(axis), y_most)
+            found.append(("GS", most / self._inside(boxes), none))
+        elif compliance is not None:
             G = (np.abs(g) + e) * _lengths(c) * _lengths(self.plant.pushed)
             NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
             GS = y_max * a2 / n * NG / (compliance * self._inside(boxes))

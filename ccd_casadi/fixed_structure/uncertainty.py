@@ -91,9 +91,13 @@ class UncertainPlant:
 
     @property
     def encloses_forces(self) -> bool:
-        """Whether what forces move is enclosed over the box: one mode after the other as the loop
-        has them, at its output, of modes that do not move."""
-        return self.own is None or not (self.own.counted or self.ranges)
+        """Whether what forces move is enclosed over the box: of modes that do not move, without a
+        filter between what counts and the sensor, and of one free body at most."""
+        if self.own is None or not self.own.counted:
+            return self.own is None or not self.ranges
+        filtered = any(option.wiring.sensor for option in self.options)
+        bodies = max(int(self.modal(i).rigid.sum()) for i in range(len(self.options)))
+        return not self.ranges and not filtered and bodies <= 1
 
     @property
     def _free(self) -> Suspension:
@@ -299,8 +303,8 @@ class ModalSum:
     moving : callable or None
         ω and b_i c_i over boxes of the parameters that modes move with, the last ones; see
         `moving_modes`.
-    forced : array (n, q) or None
-        b_i of disturbing forces; None: those of `drive`.
+    forced, counted : array (n, q), (n, z) or None
+        b_i of disturbing forces and c_i of what counts; None: those of `drive` and `reading`.
     """
 
     omega: Array
@@ -312,6 +316,7 @@ class ModalSum:
     away: np.ndarray
     moving: Callable[[Array, Array], tuple[list[list[Affine]], np.ndarray]] | None = None
     forced: Array | None = None
+    counted: Array | None = None
 
     @property
     def pushed(self) -> Array:
@@ -393,12 +398,13 @@ def modal_sum(
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > uncoupled * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
-    B, C, E = modal.B[order] / unit**2, modal.C.T[order], None
+    B, C, E, F = modal.B[order] / unit**2, modal.C.T[order], None, None
     if (own := uncertain.own) is not None:
-        (B, E), C = own.drives(B), C[:, : own.outputs]
+        (B, E), (C, F) = own.drives(B), np.split(C, [own.outputs], axis=1)
+        F = F[:, : own.counted] if own.counted else None
     found = ModalSum(
         omega[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta, B, C, away[order],
-        forced=E,
+        forced=E, counted=F,
     )  # fmt: skip
     if not uncertain.ranges:
         return found
@@ -409,7 +415,8 @@ def modal_sum(
     moving = partial(moving_modes, graph, int(modal.rigid.sum()), unit)
     model = uncertain.nominal[-len(uncertain.ranges) :, None]
     known = moving(model, model)[1].all()
-    return replace(found, drive=one, reading=one, moving=moving, forced=None) if known else None
+    alone = replace(found, forced=None, counted=None)
+    return replace(alone, drive=one, reading=one, moving=moving) if known else None
 
 
 def _least(f: Affine) -> Array:

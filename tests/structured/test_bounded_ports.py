@@ -14,7 +14,8 @@ from ccd_casadi.codesign.final_judgement import other_damping, plants_of_set
 from ccd_casadi.codesign.joint_model import JointModel, JointPoint
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, ProofOutcome, _families, prove
+from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import SectionsDesign, problem_for
@@ -28,7 +29,7 @@ from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.kernels.sections import LoopCurve
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.lti.wiring import Filters, OwnPorts, Wiring
+from ccd_casadi.lti.wiring import Filters, ForcedPlant, OwnPorts, Wiring
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.support.text import HZ
@@ -240,8 +241,10 @@ def test_the_bound_is_kept_and_binds_on_the_set(
 
 
 @pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("ports", [(2, 0, BARE), (1, 0, AMPLIFIER)])
-def test_a_force_elsewhere_is_proven_and_refuted(
+@pytest.mark.parametrize(
+    "ports", [(2, 0, BARE), (1, 0, AMPLIFIER), (1, 1, BARE), (2, 1, AMPLIFIER)]
+)
+def test_forces_and_errors_elsewhere_are_proven_and_refuted(
     designs: Known, ports: Key, run: Sampling | None
 ) -> None:
     _, design, bounds = designed(designs, ports, run)
@@ -256,11 +259,56 @@ def test_a_force_elsewhere_is_proven_and_refuted(
     assert prove(box, *of, loose, run).outcome is ProofOutcome.REFUTED
 
 
-def test_an_error_elsewhere_is_judged_not_proven(designs: Known) -> None:
-    ports: Key = (1, 1, BARE)
-    _, design, bounds = designed(designs, ports, None)
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("integrator", [True, False])
+@pytest.mark.parametrize("ports", [(1, 0, BARE), (1, 1, BARE), (2, 1, AMPLIFIER), (1, 2, BARE)])
+def test_boxes_enclose_what_forces_move(ports: Key, integrator: bool, run: Sampling | None) -> None:
+    """Boxes of frequency, shift, damping and gain, some from rest on: plants inside them by the
+    matrices as they are written."""
+    structure = Structure(integrator=integrator, biquads=0)
+    kappa = a_controller()[[i for i, name in enumerate(STRUCTURE.names) if name in structure.names]]
+    box, K = (
+        box_of(*ports, resonance_shift=0.1, damping=(0.5, 2.0), gain=0.1),
+        structure.state_space(kappa),
+    )
+    of = (structure, kappa, HZ * 20.0, BOUNDS, run)
+    families = _families(box, *of, BoxProofOptions())
+    assert not isinstance(families, ProofOutcome)
+    (family,) = families
+    rng, unit, seen = np.random.default_rng(0), family.unit, 0
+    scale = 1.0 if run is None else family.period
+    for begin in [0.0, *np.geomspace(0.5, HZ * 900.0, 60).tolist()]:
+        ends = np.array([begin, begin * rng.uniform(1.001, 1.1) if begin else 3.0]) / unit
+        low, high = box.box
+        inner = np.sort(low[:, None] + rng.uniform(0, 1, (3, 2)) * (high - low)[:, None], axis=1)
+        inner[:, 1] = inner[:, 0] + rng.uniform(0.0, 0.1) * (inner[:, 1] - inner[:, 0])
+        chart = Chart.LOW if run is None else Chart.SAMPLED
+        one = Boxes(np.array([chart]), np.vstack([ends * scale, inner])[:, :1],
+                    np.vstack([ends * scale, inner])[:, 1:])  # fmt: skip
+        with np.errstate(all="ignore"):
+            found = family.enclose(one)
+        k = found.names.index("GS")
+        for share in rng.uniform(0, 1, (4, 4)):
+            at = one.low[:, 0] + share * (one.high - one.low)[:, 0]
+            (plant,) = box.as_written([(0, at[1:])])
+            assert isinstance(plant, ForcedPlant)
+            forced, driven = plant.mechanics, plant.counted or plant
+            rows = slice(0 if plant.counted is None else 1, None)
+            parts = (plant.A, driven.B, forced.B, plant.C, forced.C[rows])
+            (value,) = moved(parts, K, run, np.array([max(at[0] / scale * unit, 0.02)])) / 3e-5
+            assert found.lowest[k, 0] * (1.0 - 1e-6) <= value <= found.highest[k, 0] * (1.0 + 1e-6)
+        seen += bool(found.highest[k, 0] < 1.5 * value)
+    assert seen > 20  # so that they are not infinite
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_an_error_before_a_filter_is_judged_not_proven(
+    designs: Known, run: Sampling | None
+) -> None:
+    ports: Key = (2, 1, BOTH)
+    _, design, bounds = designed(designs, ports, run)
     box = box_of(*ports, resonance_shift=0.02)
-    proof = prove(box, design.structure, design.kappa, design.bandwidth, bounds)
+    proof = prove(box, design.structure, design.kappa, design.bandwidth, bounds, run)
     assert proof.outcome is ProofOutcome.PROVEN
     assert proof.unproven == "compliance_max is judged, not proven"
     assert "GS" not in proof.levels
