@@ -24,7 +24,7 @@ from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import Loop, Sampling
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -400,10 +400,12 @@ def _families(
 ) -> list[LoopFamily] | ProofOutcome:  # fmt: skip
     """The loops of every option, or why there is no proof of them."""
     outputs, inputs = structure.directions
+    first = uncertain.options[0]
+    own = uncertain.own or OwnPorts(len(first.C), first.B.shape[1])
+    if own.outputs != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
+        return ProofOutcome.NOT_SQUARE
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
-    if len(models[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
-        return ProofOutcome.NOT_SQUARE
     K = structure.state_space(kappa)
     if not all(Loop(model, K, sampling).stable for model in models):
         return ProofOutcome.UNSTABLE
@@ -414,8 +416,8 @@ def _families(
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
     kind = LoopFamily if bounds.error is None else SensorFamily
     families = []
-    for option, (system, model) in enumerate(zip(uncertain.options, models, strict=True)):
-        low_pass = _low_pass(system, model, sampling, options.poles_apart)
+    for option, system in enumerate(uncertain.options):
+        low_pass = _low_pass(system, own, sampling, options.poles_apart)
         if low_pass is None:
             return ProofOutcome.WIRED
         plant = modal_sum(uncertain, option, unit)
@@ -431,10 +433,10 @@ def _families(
 
 
 def _low_pass(
-    system: Mechanics, model: StateSpace, sampling: Sampling | None, apart: float
+    system: Mechanics, own: OwnPorts, sampling: Sampling | None, apart: float
 ) -> np.ndarray | None:
     """The poles in rad/s that actuators and sensors add; None where the enclosures have none."""
-    poles = system.wiring.poles(len(model.C), model.B.shape[1])
+    poles = system.wiring.poles(own.outputs, own.inputs)
     if poles is None or sampling is None:
         return poles
     distance = np.abs(poles[:, None] - poles) + np.diag(np.full(len(poles), np.inf))

@@ -334,18 +334,16 @@ def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
     """
     wide = _scaled(modal, M_K, True)
     B, C = own.drives(modal.B)[0], own.readings(modal.C)[0]
-    if modal.states is None:
-        omega_0 = float(np.sqrt(M_K * np.linalg.norm(B) * np.linalg.norm(C)))
-        if not omega_0 > 0.0:
-            raise PlantError("input or output is zero: no mode is both driven and measured")
-    else:
-        order, leading = modal.states.leading
-        term = leading[: own.outputs, : own.inputs]
-        system = modal.states.system
-        found = (order, term) if term.any() else leading_term(
-            system.A, system.B[:, : own.inputs], system.C[: own.outputs]
-        )  # fmt: skip
-        omega_0 = _unit_of_frequency(found, M_K)
+    leading = 2, np.array([[np.linalg.norm(B) * np.linalg.norm(C)]])
+    if (states := modal.states) is not None:
+        order, term = states.leading
+        leading = order, term[: own.outputs, : own.inputs]
+        if not leading[1].any():
+            A, B, C = states.system.A, states.system.B, states.system.C
+            leading = leading_term(A, own.drives(B)[0], own.readings(C)[0])
+    omega_0 = _unit_of_frequency(leading, M_K)
+    if not omega_0 > 0.0:
+        raise PlantError("input or output is zero: no mode is both driven and measured")
     time = wide.omega_0 / omega_0
     wide = replace(wide, A=time * wide.A, B=time * wide.B, dA=time * wide.dA, dB=time * wide.dB,
                    omega_0=omega_0)  # fmt: skip
