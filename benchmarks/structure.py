@@ -48,7 +48,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.kernels.gamma": ("BACKWARD",),
     "ccd_casadi.kernels.loop_point": (
         "G", "DG", "FREE", "DFREE", "GV", "GK", "S", "US", "M", "V", "K", "RATE", "U", "W",
-        "LEFT", "RIGHT", "SHARE", "X", "Y",
+        "LEFT", "RIGHT", "SHARE", "X", "Y", "SEEN",
     ),
     "ccd_casadi.kernels.modes": ("SIMPLE", "POSITION", "VELOCITY"),
     "ccd_casadi.kernels.sections": ("HALF_POWER", "GAIN", "INTEGRATOR", "REAL", "PAIR"),

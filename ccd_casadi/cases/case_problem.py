@@ -213,10 +213,12 @@ def _require_ports_known(problem: CoDesignProblem) -> None:
     sections = own if isinstance(own, StructuredProblem) else None
     if sections is None:
         refuse_ports(problem, 'full order, but to controller.structure = "sections" alone')
-    elif sections.compliance_max is not None:
-        refuse_ports(problem, "inner.compliance_max, which bounds the actuators' at the sensors")
     elif sections.figure is not BANDWIDTH:
         refuse_ports(problem, f'inner.minimise = "{sections.minimise}"')
+    elif sections.compliance_max is not None:
+        from ccd_casadi.inner_problem.structured_plant_set import require_bounded_ports
+
+        require_bounded_ports(problem)
     if source.places:
         refuse_ports(problem, "[places]")
 

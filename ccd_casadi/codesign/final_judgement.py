@@ -32,7 +32,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL, Perturbation
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.plants.scaling import scale_at_ports, scale_plant
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.synthesis.closed_loop import measure
@@ -128,7 +128,8 @@ def second_on_set(
     if judged is None or K is None:
         return NOT_COMPARED
     pairs = zip(plants_of_set(problem, theta), judged.plants, strict=True)
-    alike = problem.sampling is None and not problem.source.wiring  # its GS and the second's
+    wide = bool(problem.source.wiring or plant_of(problem).ports)
+    alike = problem.sampling is None and not wide  # its GS and the second's
     of_GS, bounds = ("GS",) if alike else (), kind_of(problem).bounds()
     return compared(
         (second_opinion(plant, K, problem.sampling, places=bounds.places),
@@ -316,8 +317,9 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     def judged(of: LoopsOffModel) -> SetCertificate:
         plants = []
         for place, gain in product(places, sorted(set(gains))):
-            modal = of.modal(place).driven(gain)
-            plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
+            modal = (of.at_ports or of).modal(place).driven(gain)
+            plants.append(scale_plant(modal, problem.weights.M_K, bare=True) if of.own is None
+                          else scale_at_ports(modal, problem.weights.M_K, of.own))  # fmt: skip
         return certify(plants, of.controller, bounds, of.sampling)
 
     kept = "matrix" if loops.given else "ratio"

@@ -1,7 +1,7 @@
 """J over θ, the controller and ω_b at once, on the plants of a set that hold it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -216,8 +216,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         """Those of the set there, in the units of its first one in the middle."""
         share = self.width[:, None, None]
         return [
-            in_units_of(replace(one, dA=share * one.dA, dB=share * one.dB, dC=share * one.dC),
-                        self.first)
+            in_units_of(one.with_slopes_times(share), self.first)
             for one in self.uncertain(z, known).plants(self.scenarios)
         ]  # fmt: skip
 

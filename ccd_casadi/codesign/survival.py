@@ -11,9 +11,11 @@ import scipy
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, design_loops, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, with_ports
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Loop, Sampling, tustin
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.modal import (
     FREE,
     ModalPlant,
@@ -71,6 +73,10 @@ class LoopsOffModel:
         Of several sensors on one actuator.
     ported : Loop or None
         That on the model where forces act, or the error counts, elsewhere.
+    at_ports : LoopsOffModel or None
+        Those of the plant with its ports, where the compliance between them is bounded.
+    own : OwnPorts or None
+        Which of its inputs and outputs are the loop's.
     options : SurvivalOptions
         Numbers of the ranges.
     known : dict
@@ -86,6 +92,8 @@ class LoopsOffModel:
     given: bool
     places: tuple[BreakPoint, ...] = ()
     ported: Loop | None = None
+    at_ports: "LoopsOffModel | None" = None
+    own: OwnPorts | None = None
     options: SurvivalOptions = SurvivalOptions()
     known: dict[Perturbation, Loop] = field(default_factory=dict, compare=False)
 
@@ -95,7 +103,9 @@ class LoopsOffModel:
         matrix the ratios."""
         flexible = ~self.plant.rigid
         own = np.where(flexible[:, None] & flexible, self.matrix, 0.0)
-        return replace(self, grows=own if self.given else np.zeros_like(own), known={})
+        at_ports = self.at_ports and self.at_ports.other
+        grows = own if self.given else np.zeros_like(own)
+        return replace(self, grows=grows, known={}, at_ports=at_ports)
 
     def modal(self, off: Perturbation) -> ModalPlant:
         """The plant itself; single modes are not shifted."""
@@ -261,7 +271,17 @@ def loops_of(
     found = loops_off_model(system, controller, problem.sampling, problem.suspension.free, places)
     if with_ports(problem) is problem:
         return found
-    return replace(found, ported=design_loops(problem, theta, controller)[0])
+    found = replace(found, ported=design_loops(problem, theta, controller)[0])
+    if not isinstance(problem.controller, StructuredProblem):
+        return found
+    from ccd_casadi.inner_problem.structured_plant_set import bounded_ports
+
+    wide, own = bounded_ports(problem)
+    if own is None:
+        return found
+    system = mechanics(plant_of(wide), theta)
+    at_ports = loops_off_model(system, controller, problem.sampling, problem.suspension.free)
+    return replace(found, at_ports=at_ports, own=own)
 
 
 def growth_of(loop: Loop) -> float:

@@ -41,7 +41,14 @@ from ccd_casadi.deployment.realisation import (
     realise,
     with_anti_windup,
 )
-from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
+from ccd_casadi.deployment.robust_set import (
+    Member,
+    MemberLoop,
+    WorstFirst,
+    as_written,
+    forced_model,
+    members,
+)
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
@@ -388,7 +395,9 @@ def _assessed(
         found = replace(found, rounding=max(bounds, key=lambda one: one.largest))
     if most is None or not found.stable:
         return found
-    gains = {at: sampled_compliance(plants[at], G, K, places) for at, G in held.items()}
+    forced = plants | {nominal: forced_model(run)}
+    gains = {at: sampled_compliance(forced[at], G, K, places, delay=delay)
+             for at, G in held.items()}  # fmt: skip
     return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))
 
 

@@ -115,6 +115,14 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     )
 
 
+def forced_model(run: FinishedRun) -> StateSpace:
+    """The model in SI, with what disturbing forces move where a bound is on it."""
+    if not kind_of(run.problem).as_designed:
+        return run.plant.plant_si()
+    uncertain = uncertain_plant(run.problem, run.theta)
+    return uncertain.plant(uncertain.nominal).plant_si()
+
+
 def as_written(run: FinishedRun) -> list[StateSpace]:
     """The model and every plant of the dense set, by the matrices as the plant function returned
     them."""

@@ -24,6 +24,7 @@ from ccd_casadi.fixed_structure.enclosure import Enclosures, LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers, results
@@ -280,7 +281,7 @@ class Proof:
     @property
     def conclusive(self) -> bool:
         """Whether it proves all that is required, and closely: no plant need be drawn besides."""
-        return self.proven and self.slack <= BoxProofOptions.slack
+        return self.proven and not self.left and self.slack <= BoxProofOptions.slack
 
     @property
     def refuted(self) -> bool:
@@ -395,6 +396,9 @@ def prove(
     many = several or len(names) > options.few_parameters
     if slack is None:
         slack = options.slack_of_many if many else options.slack
+    judged = bounds.compliance_max is not None and not uncertain.encloses_forces
+    if judged:
+        bounds = replace(bounds, compliance_max=None)
     families = _families(uncertain, structure, kappa, bandwidth, bounds, sampling, options)
     if isinstance(families, ProofOutcome):
         return Proof(families, slack, names)
@@ -404,7 +408,8 @@ def prove(
     proof = divide(families, uncertain.box, slack, most, workers, enough, options)
     # where sensors share an actuator every place is enclosed
     single = bounds.error is None and any(c.given for c in bounds.channels)
-    return replace(proof, left="bounds of single channels are judged, not proven" if single else "")
+    left = "bounds of single channels are" if single else "compliance_max is" if judged else ""
+    return replace(proof, left=f"{left} judged, not proven" if left else "")
 
 
 def _families(
@@ -413,7 +418,9 @@ def _families(
 ) -> list[LoopFamily] | ProofOutcome:  # fmt: skip
     """The loops of every option, or why there is no proof of them."""
     outputs, inputs = structure.directions
-    if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
+    first = uncertain.options[0]
+    own = uncertain.own or OwnPorts(len(first.C), first.B.shape[1])
+    if own.outputs != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
         return ProofOutcome.NOT_SQUARE
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
@@ -428,7 +435,7 @@ def _families(
     kind = LoopFamily if bounds.error is None else SensorFamily
     families = []
     for option, system in enumerate(uncertain.options):
-        low_pass = _low_pass(system, sampling, options.poles_apart)
+        low_pass = _low_pass(system, own, sampling, options.poles_apart)
         if low_pass is None:
             return ProofOutcome.WIRED
         plant = modal_sum(uncertain, option, unit)
@@ -443,9 +450,11 @@ def _families(
     return families
 
 
-def _low_pass(system: Mechanics, sampling: Sampling | None, apart: float) -> np.ndarray | None:
+def _low_pass(
+    system: Mechanics, own: OwnPorts, sampling: Sampling | None, apart: float
+) -> np.ndarray | None:
     """The poles in rad/s that actuators and sensors add; None where the enclosures have none."""
-    poles = system.wiring.poles(len(system.C), system.B.shape[1])
+    poles = system.wiring.poles(own.outputs, own.inputs)
     if poles is None or sampling is None:
         return poles
     distance = np.abs(poles[:, None] - poles) + np.diag(np.full(len(poles), np.inf))

@@ -14,60 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.boxes import Boxes, FrequencyAxis, axis_of, gain_of
-from ccd_casadi.fixed_structure.discs import GUARD, Discs
+from ccd_casadi.fixed_structure.discs import GUARD, Discs, Fraction
 from ccd_casadi.fixed_structure.enclosure import Enclosures, LoopFamily
 from ccd_casadi.support.arrays import Array
-
-
-@dataclass(frozen=True)
-class Fraction:
-    """N/D of V uncertain numbers δ_v, |δ_v| <= r_v, on boxes.
-
-    N = N_c + Σ α_v δ_v and D = D_c + Σ β_v δ_v.
-
-    Attributes
-    ----------
-    above, below : array (B,)
-        N_c and D_c.
-    of_above, of_below, radius : array (B, V)
-        α, β and r.
-    beside : array (B,)
-        What bounds everything else in D, and in N at most as much.
-    """
-
-    above: np.ndarray
-    below: np.ndarray
-    of_above: np.ndarray
-    of_below: np.ndarray
-    radius: Array
-    beside: Array
-
-    def enclosed(self) -> tuple[Array, Array, Array, np.ndarray]:
-        """Enclose |N/D|.
-
-            N/D - S = (N - S D)/D = Σ δ_v (α_v - S β_v)/D,   S = N_c/D_c
-            |D| >= |D_c|(1 - R),   R = (Σ r_v |β_v| + ρ)/|D_c|,   ρ what is beside
-            ||N/D| - |S|| <= (Σ r_v |α_v - S β_v| + ρ(1 + |S|))/(|D_c|(1 - R))   where R < 1
-
-        Returns
-        -------
-        upper, lower : array (B,)
-            |N/D| is at most and at least this.
-        moved : array (B, V)
-            By how much each δ_v moves it per radius, to first order.
-        good : bool array (B,)
-            Where R < 1: D has no zero; elsewhere nothing is known.
-        """
-        good = np.abs(self.below) > 0.0
-        size = np.where(good, np.abs(self.below), 1.0)
-        S = self.above / np.where(good, self.below, 1.0)
-        R = ((self.radius * np.abs(self.of_below)).sum(axis=1) + self.beside) / size
-        good &= R < 1.0
-        left = np.where(good, 1.0 - R, 1.0)
-        moved = np.abs(self.of_above - S[:, None] * self.of_below) / size[:, None]
-        off = ((self.radius * moved).sum(axis=1) + self.beside * (1.0 + np.abs(S)) / size) / left
-        upper, lower = np.abs(S) + off, np.maximum(np.abs(S) - off, 0.0)
-        return np.where(good, upper, np.inf), np.where(good, lower, 0.0), moved, good
 
 
 @dataclass(frozen=True)

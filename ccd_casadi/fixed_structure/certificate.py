@@ -9,7 +9,8 @@ every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_r
 loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
 `lti.between_samples`). Its GS and weighted KS and T are products of functions of z and of s, which
 no Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
-GS of a wired plant is S times its mechanics, of a force on these, and known there too.
+GS of a wired plant is S times its mechanics, of a force on these, and known there too; where
+forces act elsewhere or something else counts it is theirs, of a continuous loop by its states.
 """
 
 from collections.abc import Sequence
@@ -46,8 +47,8 @@ from ccd_casadi.fixed_structure.certificate_responses import (
 )
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, weighted
-from ccd_casadi.lti.wiring import WiredPlant
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper, weighted
+from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import HZ, counted
@@ -184,7 +185,7 @@ def certify(
         Stability, figures over bounds, and ω_b in rad/s, the least of all plants.
     """
     systems = [own if isinstance(own, StateSpace) else own.plant_si() for own in plants]
-    bare = any(isinstance(G, WiredPlant) for G in systems)
+    bare = any(isinstance(G, ForcedPlant) and not _same_states(G) for G in systems)
     sizes = [(G.A.shape, G.B.shape, G.C.shape) for G in systems]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
     batch = options.batch
@@ -244,6 +245,10 @@ def judged(
     if sampling is not None:
         G, held = [sampled(one, sampling) for one in own], as_run(K, sampling)
     free = [balanced_system(getattr(plant, "mechanics", plant)) for plant in plants]
+    others = [getattr(plant, "counted", None) for plant in plants]
+    driven = [balanced_system(one) for one in others if one is not None]
+    if sampling is not None:
+        driven = [sampled(one, sampling) for one in driven]
     if plants[0].period:  # what acts on it between its instants is not known
         free = G
     loops = [error_response(one, held) for one in G]
@@ -269,17 +274,17 @@ def judged(
                                   options.curves))  # fmt: skip
     grid, rows = padded(grids), np.arange(len(good))
     table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
-                          integrator)  # fmt: skip
+                          integrator, [driven[i] for i in good] if driven else ())  # fmt: skip
     if not integrator:
         grid = np.concatenate([_at_rest(table, grid[:, :1], options), grid], axis=1)
-    if len(free[0].C) > 1 and bounds.error is None:
+    if len(own[0].C) > 1 and bounds.error is None:
         grid, values = with_crossings(table, grid, options.curves)
     else:
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values, options.curves)
     beyond_half_the_rate = np.zeros(len(good))
-    if table.free is not None and bounds.compliance_max is not None:
+    if table.period is not None and table.free is not None and bounds.compliance_max is not None:
         beyond, at = _compliance_beyond(table, [free[i] for i in good], options)
         larger = beyond > tops["GS"][0]
         tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
@@ -287,7 +292,7 @@ def judged(
     loops = [loops[i] for i in good]
     inputs = [_at_the_actuator(loop, G[i], held) for loop, i in zip(loops, good, strict=True)]
     for k, i in enumerate(good):
-        _raised(tops, k, loops[k], G[i], held, bounds, table)
+        _raised(tops, k, loops[k], G[i], held, bounds, table, plants[i])
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
     whole = loops
     if bounds.error is not None:
@@ -320,7 +325,7 @@ def judged(
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
-            static_compliance=0.0 if integrator else float(values["GS"][k, 0]),
+            static_compliance=float(values["GS"][k, 0]) if driven or not integrator else 0.0,
             low_compliance=float(low["GS"][k, 0]),
             confirmed=bool(confirmed[k]),
             channels=tuple(channels[k]),
@@ -335,19 +340,21 @@ def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Arra
     itself: without an integrator beside channels of free bodies, whose |L| grows without bound,
     nothing would be left of it at too low a frequency.
     """
-    shares = np.sort(options.rest)
-    sizes = table.open_loops(np.arange(len(lowest)), lowest * shares)
-    kept = np.finfo(float).eps * sizes[..., -1] / (1.0 + sizes[..., 0]) <= options.lost
+    shares, rows = np.sort(options.rest), np.arange(len(lowest))
+    sizes = table.open_loops(rows, lowest * shares)
+    lost = sizes[..., -1] / (1.0 + sizes[..., 0]) + table.lost(rows, lowest * shares)
+    kept = np.finfo(float).eps * lost <= options.lost
     first = np.where(kept.any(axis=1), kept.argmax(axis=1), len(shares) - 1)
     return np.asarray(lowest * shares[first][:, None])
 
 
 def _raised(
     tops: dict[str, tuple[Array, Array]], row: int, loop: StateSpace, G: StateSpace,
-    K: StateSpace, bounds: Bounds, table: LoopResponses,
+    K: StateSpace, bounds: Bounds, table: LoopResponses, plant: StateSpace,
 ) -> None:  # fmt: skip
     """Raise the largest KS, T and GS of plant `row`, weighted or not, to what a Hamiltonian finds
-    above them; `loop` is its S. Of a sampled loop KS and T alone; no GS of a wired plant."""
+    above them; `loop` is its S. Of a sampled loop KS and T alone; no GS of a wired plant, and that
+    of forces and errors elsewhere by the states of the `plant` as it was given."""
     period = table.period
     zero, p = np.zeros((len(G.C), len(K.A))), len(G.C)
     of_u, of_y = np.hstack([-K.D @ G.C, K.C]), np.hstack([G.C, zero])
@@ -362,6 +369,8 @@ def _raised(
         d = np.vstack([G.B, np.zeros((len(K.A), G.B.shape[1]))])
         if table.free is None:
             systems["GS"] = StateSpace(loop.A, d, of_y, np.zeros((p, d.shape[1])))
+        elif _same_states(plant):
+            systems["GS"] = _moved(plant, K)
         if bounds.weights is not None:
             _, of_KS, of_T = bounds.weights.filters()
             systems["weighted KS"] = weighted(KS, np.tile(of_KS, (len(K.C), 1)))
@@ -377,6 +386,20 @@ def _raised(
         norm, place = hinf_norm(replace(system, period=period or 0.0), at[row])
         if not norm <= value[row]:  # NaN stays NaN
             value[row], at[row] = norm, place
+
+
+def _same_states(plant: StateSpace) -> bool:
+    """Whether disturbing forces move a plant by the states that u does."""
+    return isinstance(plant, ForcedPlant) and np.array_equal(plant.mechanics.A, plant.A)
+
+
+def _moved(plant: StateSpace, K: StateSpace) -> StateSpace:
+    """Disturbing forces to what counts, of a continuous loop."""
+    assert isinstance(plant, ForcedPlant)
+    A, own, k = error_response(plant, K).A, plant.mechanics, len(K.A)
+    C = own.C if plant.counted is None else own.C[len(plant.C) :]
+    B, C = np.vstack([own.B, np.zeros((k, own.B.shape[1]))]), np.hstack([C, np.zeros((len(C), k))])
+    return balanced_system(strictly_proper(A, B, C))
 
 
 def _compliance_beyond(

@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ChannelBounds
 from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
-from ccd_casadi.lti.wiring import WiredPlant
+from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
 
 if TYPE_CHECKING:
@@ -121,7 +121,8 @@ class Triangular:
 
 class LoopResponses:
     """The loops of a set of plants: `free` as a disturbing force moves them, `G` as the loop has
-    them, with hold and delay; K of the controller, which may have an `integrator`.
+    them, with hold and delay; K of the controller, which may have an `integrator`. Where something
+    else than the outputs is `counted`, from u as the loop has it, it is below these in `free`, too.
 
     At a pole of G on the axis S, KS, T and GS have limits, which are taken a little beside it.
     """
@@ -134,9 +135,11 @@ class LoopResponses:
         sampling: Sampling | None,
         bounds: Bounds,
         integrator: bool = True,
+        counted: Sequence[StateSpace] = (),
     ) -> None:
         self.G, self.K = Triangular(G), Triangular([K])
-        alike = free[0].period or (sampling is None and not isinstance(G[0], WiredPlant))
+        self.counted = Triangular(counted) if counted else None
+        alike = free[0].period or (sampling is None and not isinstance(G[0], ForcedPlant))
         self.free = None if alike else Triangular(free)
         self.period = None if sampling is None else sampling.period
         self.bounds, self.integrator = bounds, integrator
@@ -217,18 +220,34 @@ class LoopResponses:
         omega = self._off_poles(which, omega)
         S, g, k = self._loops(which, omega)
         free = g if self.free is None else self.free.at(which, 1j * omega)
-        KS = _product(k, S)
-        found = {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
+        KS, p = _product(k, S), g.shape[-2]
+        found = {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free[..., :p, :])}
+        if self.counted is not None:
+            driven = self.counted.at(which, self._points(omega))[..., p:, :]
+            found["GS"] = free[..., p:, :] - driven @ KS @ free[..., :p, :]
         if self.bounds.error is not None:
             found["S at the actuator"] = np.linalg.inv(np.eye(k.shape[-2]) + k @ g)
         return found
 
     def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        omega = self._off_poles(which, omega)
-        s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
+        s = self._points(self._off_poles(which, omega))
         g, k = self.G.at(which, s), self.K.at(which, s)
         open_ = np.eye(g.shape[-2]) + _product(g, k)
         return (1.0 / open_ if open_.shape[-1] == 1 else np.linalg.inv(open_)), g, k
+
+    def _points(self, omega: Array) -> np.ndarray:
+        """s, of a sampled loop z."""
+        return 1j * omega if self.period is None else np.exp(1j * omega * self.period)
+
+    def lost(self, which: np.ndarray, omega: Array) -> Array:
+        """How many times larger than what forces move is what they move without K (N, k), where
+        that is subtracted: rounding of the latter is that of the former."""
+        if self.counted is None:
+            return np.zeros(omega.shape)
+        assert self.free is not None
+        omega = self._off_poles(which, omega)
+        alone = sigma_max(self.free.at(which, 1j * omega)[..., self.G.C.shape[1] :, :])
+        return np.asarray(alone / sigma_max(self._matrices(which, omega)["GS"]))
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

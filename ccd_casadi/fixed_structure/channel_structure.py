@@ -212,9 +212,10 @@ def sensors_on_one_actuator(
 
 def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
     """Uᵀ G V, the same states."""
-    U, V, own = decoupling.outputs, decoupling.inputs, plant.mechanics
-    return replace(plant, B=plant.B @ V, C=U.T @ plant.C, dB=plant.dB @ V, dC=U.T @ plant.dC,
-                   channels=(), mechanics=own and in_channels(own, decoupling))  # fmt: skip
+    U, V = decoupling.outputs, decoupling.inputs
+    found = replace(plant, B=plant.B @ V, C=U.T @ plant.C, dB=plant.dB @ V, dC=U.T @ plant.dC,
+                    channels=())  # fmt: skip
+    return found.forced_as(lambda own: in_channels(own, decoupling))
 
 
 def sensor_levels(plant: ScaledPlant, decoupling: Decoupling) -> Array:
@@ -317,13 +318,13 @@ def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:
     ScaledPlant
         The same plant, with the ω₀ and the force of `first`.
     """
-    time, own = plant.omega_0 / first.omega_0, plant.mechanics
+    time = plant.omega_0 / first.omega_0
     drive = time * first.force / plant.force
-    return replace(
+    found = replace(
         plant, A=time * plant.A, B=drive * plant.B, dA=time * plant.dA, dB=drive * plant.dB,
         omega_0=first.omega_0, force=first.force, channels=(), family=(),
-        mechanics=own and in_units_of(own, first),
     )  # fmt: skip
+    return found.forced_as(lambda own: in_units_of(own, first))
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, FrequencyAxis, axis_of, gain_of
 from ccd_casadi.fixed_structure.discs import GUARD, Discs, RankOneDiscs, discs_of, norm
+from ccd_casadi.fixed_structure.force_discs import ForceDiscs
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
@@ -89,8 +90,8 @@ class LoopDiscs:
         The n modes with and without hold and delay, as `discs_of` has them.
     m, r, g, e : array (N, n)
         Middles and radii of `held`, then of `free`; 0 where a box is not `good`.
-    c, b : array (n, p), (n, m)
-        The modes' directions of outputs and inputs.
+    c, b, f : array (n, p), (n, m), (n, q)
+        The modes' directions of outputs, inputs and disturbing forces.
     K : array (N, m, p)
         K_c.
     finite, good : array (n, N), (N,)
@@ -115,6 +116,7 @@ class LoopDiscs:
     e: Array
     c: Array
     b: Array
+    f: Array
     K: np.ndarray
     finite: np.ndarray
     good: np.ndarray
@@ -177,7 +179,7 @@ class LoopDiscs:
 
     def GS(self) -> FigureBounds:
         """Enclose ‖yM₂⁻¹G‖ by (17) to (19)."""
-        c, b, rows = self.c, self.b, self.terms.rows
+        c, b, rows = self.c, self.f, self.terms.rows
         G = (c.T * self.g[:, None]) @ b
         WG, by_all = self.W @ G, _lengths(c) * _lengths(b)
         rounding = GUARD * self.w * (np.abs(self.g) @ by_all)
@@ -288,10 +290,10 @@ class LoopFamily:
             (15)  ‖K_c T₁E M₂⁻¹‖ <= v = ε a₂(‖K_c‖ + k₁ max|y|)
             (16)  ‖K̂M₂⁻¹‖ <= (1 + ε)(k₁ + v) + ‖F‖a₂,
                   ‖K̂M₂⁻¹‖ >= (1 - ε)(‖K_c W‖ - kd - (k₁ - k) - v) - ‖F‖a₂
-            (17)  ‖M_d⁻¹G‖ <= h,   G in its discs, of radius e_i      `RankOneDiscs.largest`
+            (17)  ‖M_d⁻¹G‖ <= h,   G = Σ g_i c_i f_iᵀ, discs e_i      `RankOneDiscs.largest`
             (18)  ‖yM₂⁻¹G‖ <= max|y| h(1 + a₁δ)/(1 - q)
             (19)  ‖yM₂⁻¹G‖ >= (|y_c|(‖WG_c‖ - a d_G) - (δ_y + max|y| a₁δ)h)/(1 + q),
-                  d_G = Σ e_i |c_i| |b_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
+                  d_G = Σ e_i |c_i| |f_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
 
         by (15) K_c T₁ = K_c - yK_c M₁⁻¹, (16) M₂⁻¹ = M₁⁻¹ - T₁E M₂⁻¹, (18) yM₂⁻¹G =
         y(1 + T₁E)⁻¹(1 - M₁⁻¹(Δ_y + Δ_GK))M_d⁻¹G; each lower bound, k and h less or more the
@@ -330,16 +332,17 @@ class LoopFamily:
             figures["KS"] = loop.KS()
             found += self._weighted(boxes, level, figures["KS"][:2], figures["T"][:2])
         if compliance is not None:
-            figures["GS"] = loop.GS()
+            elsewhere = self.plant.counted is not None
+            figures["GS"] = self._moved(loop) if elsewhere else loop.GS()
             upper, lower, *_ = figures["GS"]
-            limit = compliance * self._inside(boxes)
+            limit = self._inside(boxes) * (1.0 if elsewhere else compliance)
             found.append(("GS", upper / limit, lower / limit))
         names, most_at, least_at = zip(*found, strict=True)
         highest, lowest = np.array(most_at), np.array(least_at)
         highest = np.where(loop.good & ~np.isnan(highest), highest, np.inf)
         lowest = np.where(loop.good & np.isfinite(lowest), lowest, 0.0)
         of = np.array([name if name in figures else "S" for name in names])
-        several = figures if len(self.outputs) > 1 else {}
+        several = figures if len(self.outputs) > 1 or self.plant.counted is not None else {}
         spread = loop.spread(of[np.argmax(highest, axis=0)], several)
         return Enclosures(names, highest, lowest, spread, loop.good)
 
@@ -378,9 +381,31 @@ class LoopFamily:
         u2 = u1 + q * y_max * a2  # (9)
         d = (r * _lengths(c) * _lengths(terms.rows)).sum(axis=1)  # (10)
         return LoopDiscs(
-            held, free, m, r, g, e, c, b, K, finite, good, y, y_max, delta_y, epsilon, grain, terms,
-            W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
+            held, free, m, r, g, e, c, b, self.plant.pushed, K, finite, good, y, y_max, delta_y,
+            epsilon, grain, terms, W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
         )  # fmt: skip
+
+    def _moved(self, loop: LoopDiscs) -> FigureBounds:
+        """Enclose what a force moves over its bound, where not the sensor counts."""
+        of_gain = loop.epsilon * np.abs(loop.K[:, 0, 0]) + loop.grain
+        y = loop.y, loop.y_max, loop.delta_y
+        return FigureBounds(
+            *self._force_discs((loop.m, loop.r, loop.g, loop.e), loop.K, of_gain, y, None)
+        )
+
+    def _force_discs(
+        self, modes: tuple[np.ndarray, ...], K: np.ndarray, of_gain: Array,
+        y: tuple[np.ndarray, Array, Array], at_rest: Array | None,
+    ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+        """`ForceDiscs.enclosed` of modes (m, r, g, e), K̂ and y."""
+        m, r, g, e = modes
+        plant, alike = self.plant, self.period is None and not self.low_pass
+        assert plant.counted is not None
+        assert self.bounds.compliance_max is not None
+        numbers = ForceDiscs(m, r, g, e, alike, K[:, 0, 0], of_gain, y[0], y[2], at_rest,
+                             plant.rigid)  # fmt: skip
+        z = plant.counted / self.bounds.compliance_max
+        return numbers.enclosed(plant.reading[:, 0], plant.drive[:, 0], z, plant.pushed)
 
     def _at_rest(self, boxes: Boxes) -> Enclosures:
         """The same, upper bounds alone, on boxes at rest, of a plant with free bodies.
@@ -403,7 +428,7 @@ class LoopFamily:
             (5)  ‖(NM₂)⁻¹N‖ <= a₂ = n a₁/(1 - ε(1 + max|y| n a₁))
 
             ‖S‖ <= max|y| a₂,  ‖K̂S/y‖ <= ((1 + ε)‖K_c‖ + ‖F‖)a₂,  ‖T‖ <= 1 + ‖S‖,
-            ‖GS‖ <= max|y| a₂/n (‖G_R‖ + n‖G_F‖)
+            ‖GS‖ <= max|y| a₂/n (‖G_R‖ + n‖G_F‖), with f_i in the place of b_i
 
         Σ_R and Σ_F are sums over the free and the other modes.
         """
@@ -423,6 +448,7 @@ class LoopFamily:
         mu = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
         good &= mu > 0.0
         mu = np.where(good, mu, 1.0)
+        m_y, r_y, g_y, e_y = (part.copy() for part in (m, r, g, e))
         for part in (m, r, g, e):  # from here on those of G_R
             part[:, rigid] /= mu[:, None]
         q = axis.y.size**2 / mu
@@ -451,8 +477,13 @@ class LoopFamily:
         if level is not None:
             KS = ((1.0 + epsilon) * norm(K) + grain) * a2
             found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
-        if compliance is not None:
-            G = (np.abs(g) + e) * _lengths(c) * _lengths(b)
+        if compliance is not None and self.plant.counted is not None:
+            y_most = axis.y.size**2
+            grain_of = epsilon * np.abs(K[:, 0, 0]) + grain
+            most, *_ = self._force_discs((m_y, r_y, g_y, e_y), K, grain_of, self._y(axis), y_most)
+            found.append(("GS", most / self._inside(boxes), none))
+        elif compliance is not None:
+            G = (np.abs(g) + e) * _lengths(c) * _lengths(self.plant.pushed)
             NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
             GS = y_max * a2 / n * NG / (compliance * self._inside(boxes))
             found.append(("GS", GS, none))

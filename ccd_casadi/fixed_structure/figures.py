@@ -287,7 +287,7 @@ def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Ar
     array (M, n_θ)
         ∂c/∂θ.
     """
-    slopes, v, which = problem.plants.slopes, constraints.v, problem.plants_of(constraints)
+    slopes, v, which = problem.plants.driven.slopes, constraints.v, problem.plants_of(constraints)
     *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints)
     out = form_slopes(slopes, which, v, x, y, False)
     free = constraints.curve == LoopCurve.GS

@@ -89,14 +89,14 @@ class LoopProblem:
 
     @cached_property
     def answers(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the plants answer at `fixed`, to u and to a disturbing force, (P, k, p, m)."""
+        """What the plants answer at `fixed`, to u (P, k, p + z, m) and to disturbing forces."""
         P, v = self.plants, self.fixed
         which = np.repeat(np.arange(P.count), v.shape[1])
         free = P.forced.modes._replace(period=0.0, delay=0.0)
-        pairs = ((P.modes, v), (free, P.frequency(v)))
-        shape = (*v.shape, *P.residues.shape[2:])
+        pairs = ((P.driven.modes, v), (free, P.frequency(v)))
         held, bare = (responses(modes, which, at.ravel())[:, 0] for modes, at in pairs)
-        return held.reshape(shape).copy(), bare.reshape(shape).copy()
+        held, bare = (part.reshape(*v.shape, *part.shape[1:]).copy() for part in (held, bare))
+        return held, bare
 
     def __getstate__(self) -> dict[str, object]:
         """Without what another process computes as fast as it reads it."""
@@ -266,8 +266,9 @@ class LoopProblem:
         limits[Limit.BANDWIDTH] = np.exp(tau + self.leads)
         plants = self.plants
         factors, channel = self._factors
-        return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,
-                          limits, self._rows, self._kinds, plants.forced.modes[:2])  # fmt: skip
+        return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out,
+                          *plants.driven.modes, limits, self._rows, self._kinds,
+                          plants.forced.modes[:2], plants.lever)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -116,8 +116,11 @@ class PlantSet:
         part is that of 1/s².
     out, into : array (c, p), (m, c)
         Uᵀ and V in the coordinates of the plants: identities where they are turned.
-    mechanics : PlantSet, optional
-        The same without actuators and sensors, where it has these.
+    mechanics, counted : PlantSet, optional
+        As a `ForcedPlant` has them; what counts is N x below the outputs y.
+    lever : array (P, z, p)
+        H of what counts, H y + N x. Free bodies do not move N x: both terms of what a force moves
+        are as small as their sum towards 0 Hz. z = 0: the outputs count.
     """
 
     plants: tuple[LoopPlant, ...]
@@ -130,10 +133,17 @@ class PlantSet:
     out: Array
     into: Array
     mechanics: "PlantSet | None" = None
+    counted: "PlantSet | None" = None
+    lever: Array = field(default_factory=lambda: np.zeros((0, 0, 1)))
+
+    @property
+    def driven(self) -> "PlantSet":
+        """What u moves: the outputs, then N x."""
+        return self if self.counted is None else self.counted
 
     @property
     def forced(self) -> "PlantSet":
-        """What a disturbing force moves, at the position that counts."""
+        """What a disturbing force moves: the outputs, or the positions, then N x."""
         return self if self.mechanics is None else self.mechanics
 
     @property
@@ -268,8 +278,6 @@ def plant_set(
     not those of the channels, that has more outputs than inputs, or is not diagonalisable.
     """
     out = into = np.eye(1)
-    bare = [in_units_of(plant.mechanics, plants[0]) for plant in plants if plant.mechanics]
-    mechanics = plant_set(bare, sampling, decoupling, alike) if bare else None
     if decoupling is not None:
         out, into = decoupling.outputs.T, decoupling.inputs
     for number, plant in enumerate(plants, 1):
@@ -289,10 +297,49 @@ def plant_set(
         out = into = np.eye(len(out))
     if not plants:
         raise PlantError("there is no plant in the set; give at least one")
-    omega_0, force = plants[0].omega_0, plants[0].force
+    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
+    scaled = [in_units_of(plant, plants[0]) for plant in plants]
+    found = _set_of(scaled, sampling, (out, into), alike)
+    moved = [plant.mechanics for plant in scaled if plant.mechanics]
+    driven = [plant.counted for plant in scaled if plant.counted]
+    lever = np.zeros((len(plants), 0, len(scaled[0].C)))
+    if driven:
+        lever = np.array([_lever(one.C, own.A, len(own.C))
+                          for one, own in zip(driven, scaled, strict=True)])  # fmt: skip
+        moved, driven = ([_without_bodies(*pair) for pair in zip(part, lever, strict=True)]
+                         for part in (moved, driven))  # fmt: skip
+    both = (_set_of(part, sampling, (out, into), alike) if part else None
+            for part in (moved, driven))  # fmt: skip
+    mechanics, counted = both
+    return replace(found, mechanics=mechanics, counted=counted, lever=lever)
+
+
+def _lever(C: Array, A: Array, p: int, *, rounding: float = 1e-12) -> Array:
+    """H (z, p) of what counts, the rows of C from p on: H y is moved by free bodies as it is."""
+    q = free_chains(A)[:, 0]
+    y, z = C[:p, q], C[p:, q]
+    return np.asarray(z @ np.linalg.pinv(y, rounding)) if y.any() else np.zeros((len(z), p))
+
+
+def _without_bodies(plant: ScaledPlant, lever: Array, *, rounding: float = 1e-12) -> ScaledPlant:
+    """With N x = z - H y in the place of what counts, z; entries of free bodies that are `rounding`
+    of it are 0."""
+    p = lever.shape[1]
+    C, dC = plant.C.copy(), plant.dC.copy()
+    q, size = free_chains(plant.A)[:, 0], np.abs(C[p:]) + np.abs(lever) @ np.abs(C[:p])
+    C[p:], dC[:, p:] = C[p:] - lever @ C[:p], dC[:, p:] - lever @ dC[:, :p]
+    C[p:, q] = np.where(np.abs(C[p:, q]) <= rounding * size[:, q], 0.0, C[p:, q])
+    return replace(plant, C=C, dC=dC)
+
+
+def _set_of(
+    scaled: Sequence[ScaledPlant], sampling: Sampling | None, directions: tuple[Array, Array],
+    alike: bool,
+) -> PlantSet:  # fmt: skip
+    """Plants in one unit, of any inputs and outputs."""
+    omega_0, force = scaled[0].omega_0, scaled[0].force
     period = None if sampling is None else sampling.period * omega_0
     delay = 0.0 if sampling is None else sampling.delay * omega_0
-    scaled = (in_units_of(plant, plants[0]) for plant in plants)
     found = tuple(_loop_plant(plant, f"plant {i}", alike) for i, plant in enumerate(scaled, 1))
     poles = padded([one.poles for one in found], -1.0, complex)
     residues = padded([np.einsum("pn,nm->npm", one.reading, one.drive) for one in found],
@@ -300,8 +347,7 @@ def plant_set(
     for own, one in zip(residues, found, strict=True):
         if len(one.chains):
             own[one.chains[0, 0]] += 1j * one.free_bodies
-    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
-    return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into, mechanics)
+    return PlantSet(found, omega_0, force, period, delay, poles, residues, *directions)
 
 
 def padded(parts: Sequence[np.ndarray], fill: float = 0.0, dtype: type = float) -> np.ndarray:

@@ -23,7 +23,7 @@ from scipy.linalg import hadamard
 from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.lti.wiring import Slopes
+from ccd_casadi.lti.wiring import OwnPorts, Slopes
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import (
@@ -35,7 +35,7 @@ from ccd_casadi.plants.modal import (
     without_hidden_rigid_modes,
 )
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant, scale_at_ports, scale_plant
 from ccd_casadi.support.arrays import Array
 
 SLOPES = ("dM", "dK", "dD", "dB", "dC")  # of a modal plant
@@ -67,6 +67,8 @@ class UncertainPlant:
         An option's matrices as expressions of these, where there are any.
     rigid_modes : int, optional
         How many, where that is stated.
+    own : OwnPorts, optional
+        Of options whose further inputs and outputs are where forces act and what counts.
     """
 
     options: tuple[Mechanics, ...]
@@ -79,12 +81,23 @@ class UncertainPlant:
     along: Callable[[int, Array], Mechanics] | None = None
     graph: Callable[[int], ca.Function | None] = no_graph
     rigid_modes: int | None = None
+    own: OwnPorts | None = None
 
     @cached_property
     def modes(self) -> int:
         """The largest number of flexible modes of any option."""
         plants = [modal_plant(option, self._free) for option in self.options]
         return max(len(plant.numbered) for plant in plants)
+
+    @property
+    def encloses_forces(self) -> bool:
+        """Whether what forces move is enclosed over the box: of modes that do not move, without a
+        filter between what counts and the sensor, and of one free body at most."""
+        if self.own is None or not self.own.counted:
+            return self.own is None or not self.ranges
+        filtered = any(option.wiring.sensor for option in self.options)
+        bodies = max(int(self.modal(i).rigid.sum()) for i in range(len(self.options)))
+        return not self.ranges and not filtered and bodies <= 1
 
     @property
     def _free(self) -> Suspension:
@@ -131,9 +144,13 @@ class UncertainPlant:
             if (states := modal.states) is not None:
                 dA, dB, dC = (d[:-count] for d in states.slopes)
                 own = Slopes(dA, dB, dC)
-                return scale_plant(replace(modal, states=replace(states, slopes=own)), self.M_K,
-                                   bare=True)  # fmt: skip
+                return self._scaled(replace(modal, states=replace(states, slopes=own)))
             modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
+        return self._scaled(modal)
+
+    def _scaled(self, modal: ModalPlant) -> ScaledPlant:
+        if self.own is not None:
+            return scale_at_ports(modal, self.M_K, self.own)
         return scale_plant(modal, self.M_K, bare=True)
 
     def sloped(self, point: Array, option: int = 0) -> ScaledPlant:
@@ -146,8 +163,7 @@ class UncertainPlant:
         """
         modal, values = self._modal(point, option), np.asarray(point, float)
         if modal.states is not None:
-            return scale_plant(replace(modal, states=self._to_point(modal.states, values)),
-                               self.M_K, bare=True)  # fmt: skip
+            return self._scaled(replace(modal, states=self._to_point(modal.states, values)))
         flexible = np.flatnonzero(~modal.rigid)
         count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
         dM, dK, dD = np.zeros((3, count, n, n))
@@ -170,7 +186,7 @@ class UncertainPlant:
             if not given:
                 dD[row, at, at] = modal.D[at, at] / (1.0 + value)
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
-        return scale_plant(moved, self.M_K, bare=True)
+        return self._scaled(moved)
 
     def _to_point(self, states: FirstOrderPlant, values: Array) -> FirstOrderPlant:
         """A plant of first order with derivatives to the point; see `sloped`."""
@@ -217,10 +233,11 @@ class UncertainPlant:
         found = []
         for option, point in points:
             values, system, off = self._off(point, option)
-            found.append(as_written(
+            plant = as_written(
                 system, shift=off.shift, modes=off.modes, damping=off.damping,
                 gain=values.get("gain", 0.0), rigid_modes=self.rigid_modes,
-            ))  # fmt: skip
+            )  # fmt: skip
+            found.append(plant if self.own is None else self.own.apart(plant))
         return found
 
     def drawn(self, rng: np.random.Generator, count: int) -> list[tuple[int, Array]]:
@@ -286,6 +303,8 @@ class ModalSum:
     moving : callable or None
         ω and b_i c_i over boxes of the parameters that modes move with, the last ones; see
         `moving_modes`.
+    forced, counted : array (n, q), (n, z) or None
+        b_i of disturbing forces and c_i of what counts; None: those of `drive` and `reading`.
     """
 
     omega: Array
@@ -296,6 +315,13 @@ class ModalSum:
     reading: Array
     away: np.ndarray
     moving: Callable[[Array, Array], tuple[list[list[Affine]], np.ndarray]] | None = None
+    forced: Array | None = None
+    counted: Array | None = None
+
+    @property
+    def pushed(self) -> Array:
+        """b_i of disturbing forces (n, q)."""
+        return self.drive if self.forced is None else self.forced
 
     def shift_of(self, i: int) -> str:
         """The parameter that shifts mode i alone; none shifts a rigid one."""
@@ -372,9 +398,13 @@ def modal_sum(
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > uncoupled * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
+    B, C, E, F = modal.B[order] / unit**2, modal.C.T[order], None, None
+    if (own := uncertain.own) is not None:
+        (B, E), (C, F) = own.drives(B), np.split(C, [own.outputs], axis=1)
+        F = F[:, : own.counted] if own.counted else None
     found = ModalSum(
-        omega[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta,
-        modal.B[order] / unit**2, modal.C.T[order], away[order],
+        omega[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta, B, C, away[order],
+        forced=E, counted=F,
     )  # fmt: skip
     if not uncertain.ranges:
         return found
@@ -385,7 +415,8 @@ def modal_sum(
     moving = partial(moving_modes, graph, int(modal.rigid.sum()), unit)
     model = uncertain.nominal[-len(uncertain.ranges) :, None]
     known = moving(model, model)[1].all()
-    return replace(found, drive=one, reading=one, moving=moving) if known else None
+    alone = replace(found, forced=None, counted=None)
+    return replace(alone, drive=one, reading=one, moving=moving) if known else None
 
 
 def _least(f: Affine) -> Array:

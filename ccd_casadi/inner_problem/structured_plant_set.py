@@ -22,7 +22,14 @@ from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, with_options
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    refuse_ports,
+    scaled_plant,
+    with_options,
+    with_ports,
+)
 from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
@@ -32,6 +39,7 @@ from ccd_casadi.inner_problem.structured_problem import (
     with_structured,
 )
 from ccd_casadi.lti.ports import BreakPoint
+from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.plant import (
     Evaluate,
     FromExpressions,
@@ -196,8 +204,54 @@ def nearby(
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
-    given = structured_of(problem).uncertainty.options
-    return [with_options(problem, options) for options in ((), *given)]
+    """The problem with every option set, with its ports where they are bounded."""
+    given, (wide, _) = structured_of(problem).uncertainty.options, bounded_ports(problem)
+    return [with_options(wide, options) for options in ((), *given)]
+
+
+def bounded_ports(problem: CoDesignProblem) -> tuple[CoDesignProblem, OwnPorts | None]:
+    """Give a problem's plant its ports where the compliance between them is bounded.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    wide : CoDesignProblem
+        Of `with_ports`; the problem itself where its compliance has no bound or it has no ports.
+    own : OwnPorts or None
+        Which inputs and outputs of its plant are those of the problem's; None: all.
+    """
+    source, narrow = problem.source, plant_of(problem)
+    if source.wide or structured_of(problem).compliance_max is None or not narrow.ports:
+        return problem, None
+    wide, counted = with_ports(problem), 0
+    if "performance" in narrow.ports or source.wiring.sensor:
+        counted = plant_of(wide).outputs - narrow.outputs
+    return wide, OwnPorts(narrow.outputs, narrow.inputs, counted)
+
+
+def require_bounded_ports(problem: CoDesignProblem) -> None:
+    """Refuse a bound of the compliance between ports whose loop is of several outputs, or of
+    several forces and several errors at once.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Raises
+    ------
+    PlantError
+        It is; singular values of the compliance cross where it has several.
+    """
+    whole, own = bounded_ports(problem)
+    if own is None:
+        return
+    if own.outputs > 1 or own.inputs > 1:
+        refuse_ports(problem, "inner.compliance_max of several sensors or actuators")
+    if min(plant_of(whole).inputs - own.inputs, own.counted) > 1:
+        refuse_ports(problem, "inner.compliance_max of several forces and several errors at once")
 
 
 @dataclass(frozen=True)
@@ -225,8 +279,10 @@ class Ranged:
         evaluate, x = self.wider[option].evaluate, ca.SX.sym("x", count)
         if not isinstance(evaluate, FromExpressions):
             return None
-        theta = ca.vertcat(*self.theta, x)
-        return ca.Function("graph", [x], evaluate.matrices.call([theta])[:5])
+        M, D, K, B, C = evaluate.matrices.call([ca.vertcat(*self.theta, x)])[:5]
+        if (own := bounded_ports(self.problem)[1]) is not None:
+            B, C = B[:, : own.inputs], C[: own.outputs, :]
+        return ca.Function("graph", [x], [M, D, K, B, C])
 
 
 def uncertain_plant(
@@ -251,7 +307,7 @@ def uncertain_plant(
         problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges),
         own.along, own.graph,
-        problem.suspension.rigid_modes,
+        problem.suspension.rigid_modes, bounded_ports(problem)[1],
     )  # fmt: skip
 
 

@@ -103,7 +103,7 @@ def _compile_rows(curvature: bool) -> None:
     plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
     controller = (np.zeros((1, 4), np.int64), one, first, square, square)
     limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((3, 0, 1)), first[:0])
-    loop = loop_point.LoopArrays(*controller, *plants, *limits, plants[:2])
+    loop = loop_point.LoopArrays(*controller, *plants, *limits, plants[:2], np.ones((1, 0, 1)))
     if curvature:
         modes.responses(plants, first, one)
         loop_grid.second(first, first, first, one, loop)

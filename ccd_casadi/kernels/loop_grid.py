@@ -203,12 +203,13 @@ def second(curve, number, which, v, loop):
     array (M, n, n)
     """
     at, of, g, sigma = room(loop)
-    factors, values, channel, into, out, terms, residues, T, delay, _, own, kinds, free = loop
-    (m, c), p, n = into.shape, out.shape[1], g.size
+    factors, values, channel, into, out, terms, residues, T, delay = loop[:9]
+    _, own, kinds, free, lever = loop[9:]
+    (m, c), p, n, q = into.shape, out.shape[1], g.size, free[1].shape[4]
     z = np.complex128
     bends, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
     crossed, moved = np.empty((c, c), z), np.empty((c, c), z)
-    back, ahead = np.empty((max(m, p), c), z), np.empty((max(m, p), c), z)
+    back, ahead = np.empty((max(m, p, q), c), z), np.empty((max(m, p, q), c), z)
     for j in range(v.size):
         gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
         ω, chain = warped(T, v[j])
@@ -216,13 +217,15 @@ def second(curve, number, which, v, loop):
         if curve[j] == LoopCurve.GS:
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
-        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
+        σ, place = gain_of(
+            curve[j], number[j], into, out, own, kinds, q, lever, which[j], at, of, sigma
+        )
         kind = broken(curve[j], number[j], p, kinds)
-        columns = m if curve[j] == LoopCurve.GS else p
+        columns = q if curve[j] == LoopCurve.GS else p
         if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1
-        _by_channel(curve[j], number[j], kind, place, into, out, own, at, of, crossed, moved, back,
-                    ahead)  # fmt: skip
+        _by_channel(curve[j], number[j], kind, place, into, out, own, q, lever, which[j], at, of,
+                    crossed, moved, back, ahead)  # fmt: skip
         second_slopes(factors, g, bend)
         for a in range(n):
             i = channel[a]
@@ -233,11 +236,11 @@ def second(curve, number, which, v, loop):
                 total -= both * (crossed[i, h] + crossed[h, i])
                 if i == h:
                     total += of[SHARE, i] * (bend[a, b] + both)
-                for q in range(columns):
-                    if q != place:
-                        za = ahead[q, i] * g[a] + (back[q, i] * g[a]).conjugate()
-                        zb = ahead[q, h] * g[b] + (back[q, h] * g[b]).conjugate()
-                        total += za.conjugate() * zb * _over_gap(σ, sigma[q])
+                for f in range(columns):
+                    if f != place:
+                        za = ahead[f, i] * g[a] + (back[f, i] * g[a]).conjugate()
+                        zb = ahead[f, h] * g[b] + (back[f, h] * g[b]).conjugate()
+                        total += za.conjugate() * zb * _over_gap(σ, sigma[f])
                 first = (of[SHARE, i] * g[a]).real * (of[SHARE, h] * g[b]).real
                 bends[j, a, b] = bends[j, b, a] = total.real - 2.0 * first
     return bends
@@ -253,18 +256,22 @@ def _over_gap(σ, other):
 
 
 @inlined
-def _by_channel(curve, number, kind, place, into, out, own, at, of, crossed, moved, back, ahead):
+def _by_channel(curve, number, kind, place, into, out, own, forces, lever, of_plant, at, of,
+                crossed, moved, back, ahead):  # fmt: skip
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
     (m, c), p, at_actuator = into.shape, out.shape[1], kind == GainOf.ACTUATOR
     shared = m == 1 and p > 1
     one = over_one_plus_L(out, of[K], at) if shared else 1.0 + 0.0j
-    of_force = curve == LoopCurve.KS or at_actuator
-    rows, columns = m if of_force else p, m if curve == LoopCurve.GS else p
+    of_force, counted = curve == LoopCurve.KS or at_actuator, lever.shape[1]
+    rows, columns = m if of_force else p, forces if curve == LoopCurve.GS else p
+    levered = curve == LoopCurve.GS and counted > 0
+    if levered:
+        rows = counted
     columns = 1 if kind != GainOf.ROW else columns
     z = np.complex128
-    w = max(m, p)
+    w = max(m, p, rows, columns)
     R, P, Q = np.zeros((c, c), z), np.zeros((w, c), z), np.zeros((w, c), z)
     for i in range(c):
         for h in range(c):
@@ -281,6 +288,14 @@ def _by_channel(curve, number, kind, place, into, out, own, at, of, crossed, mov
                     P[a, i] -= into[a, h] * of[K, h] * R[h, i]
                 if at_actuator:
                     P[a, i] = -P[a, i]
+            elif levered:
+                for b in range(p):
+                    for d in range(p):
+                        P[a, i] -= lever[of_plant, a, d] * at[S, d, b] * at[GV, b, i]
+                for b in range(m):
+                    P[a, i] -= at[G, p + a, b] * into[b, i]
+                    for h in range(c):
+                        P[a, i] += at[G, p + a, b] * into[b, h] * of[K, h] * R[h, i]
             else:
                 if shared:
                     P[a, i] = sign * at[GV, a, i] * one
@@ -292,7 +307,7 @@ def _by_channel(curve, number, kind, place, into, out, own, at, of, crossed, mov
                 entry = at[V, b, q]
                 if curve == LoopCurve.GS:
                     entry = 0.0j
-                    for d in range(m):
+                    for d in range(forces):
                         entry += at[FREE, b, d] * at[V, d, q]
                 Q[q, i] += at[US, i, b] * entry
     if number >= p:

@@ -17,9 +17,10 @@ from ccd_casadi.kernels.sections import (
     warped,
 )
 
-# What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (9, w)
+# What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (10, w)
 G, DG, FREE, DFREE, GV, GK, S, US, M, V = range(10)  # GV = G V, US = Uᵀ S
-K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y = range(9)  # K_i, ∂ln K_i/∂ln v; U = ũ, W = v or G₀ v
+# K_i, ∂ln K_i/∂ln v; U = ũ, W = v or G₀ v, SEEN = ũ or ũ H
+K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y, SEEN = range(10)
 
 
 class LoopArrays(NamedTuple):
@@ -34,7 +35,7 @@ class LoopArrays(NamedTuple):
     into, out : arrays (m, c), (c, p)
         V and Uᵀ.
     terms, residues, period, delay
-        The plants (`modes.Plants`).
+        The plants (`modes.Plants`); below their p outputs y what else of the z errors N x counts.
     limits : array
         Rows of `sections.LoopCurve` and `sections.Limit`.
     rows : array (3, channels, m)
@@ -43,7 +44,9 @@ class LoopArrays(NamedTuple):
     kinds : int array (channels,)
         Of these, `sections.GainOf`.
     free : tuple of arrays
-        Terms and residues of the plants as a disturbing force moves them.
+        Terms and residues of the plants as q disturbing forces move them.
+    lever : array (P, z, p)
+        H of what counts, H y + N x; z = 0: the outputs themselves do.
     """
 
     factors: Any
@@ -59,14 +62,16 @@ class LoopArrays(NamedTuple):
     rows: Any
     kinds: Any
     free: Any
+    lever: Any
 
 
 @compiled
 def room(loop):
     """Matrices, vectors, g (n,) and σ of a point, to be filled."""
     w = max(loop.into.shape[0], loop.into.shape[1])
+    w = max(w, loop.free[1].shape[3], loop.free[1].shape[4])
     z = np.complex128
-    return np.zeros((10, w, w), z), np.zeros((9, w), z), np.zeros(loop.values.size, z), np.zeros(w)
+    return np.zeros((10, w, w), z), np.zeros((10, w), z), np.zeros(loop.values.size, z), np.zeros(w)
 
 
 @compiled
@@ -126,8 +131,8 @@ def closed(into, out, k, at):
 
 
 @compiled
-def matrix(curve, into, out, k, at):
-    """Fills M of a curve; its rows and columns."""
+def matrix(curve, into, out, k, q, at):
+    """Fills M of a curve, S G₀ of q forces; its rows and columns."""
     (m, c), p = into.shape, out.shape[1]
     if curve == LoopCurve.KS:
         for b in range(p):
@@ -137,7 +142,7 @@ def matrix(curve, into, out, k, at):
                     total += into[a, i] * (k[i] * at[US, i, b])
                 at[M, a, b] = total
         return m, p
-    columns = m if curve == LoopCurve.GS else p
+    columns = q if curve == LoopCurve.GS else p
     for a in range(p):
         for b in range(columns):
             total = 0.0j
@@ -151,6 +156,31 @@ def matrix(curve, into, out, k, at):
                 total = at[S, a, b]
             at[M, a, b] = total
     return p, columns
+
+
+@compiled
+def moved(into, out, k, q, lever, of_plant, at):
+    """Fills M with what q forces move of z errors H y + N x
+
+        H S G₀ + N₀ - N K S G₀
+
+    of which each term is as large as the sum towards 0 Hz, where G₀ alone is not; z and q.
+    """
+    (m, c), p, z = into.shape, out.shape[1], lever.shape[1]
+    for b in range(q):
+        for a in range(z):
+            total = at[FREE, p + a, b]
+            for d in range(p):
+                for e in range(p):
+                    total += lever[of_plant, a, d] * at[S, d, e] * at[FREE, e, b]
+            for i in range(c):
+                force = 0.0j
+                for d in range(p):
+                    force += k[i] * at[US, i, d] * at[FREE, d, b]
+                for e in range(m):
+                    total -= at[G, p + a, e] * into[e, i] * force
+            at[M, a, b] = total
+    return z, q
 
 
 @compiled
@@ -176,7 +206,7 @@ def broken(curve, number, p, kinds):
 
 
 @compiled
-def own_gain(curve, i, into, out, k, own, kinds, at):
+def own_gain(curve, i, into, out, k, own, kinds, q, at):
     """Gain of channel i's own; its row is in M's first row, of one place its entry."""
     (m, c), p = into.shape, out.shape[1]
     kind = broken(curve, p + i, p, kinds)
@@ -194,7 +224,7 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
             at[M, 0, 0] = over_one_plus_L(out, k, at)
         rows, columns = m, m
     else:
-        rows, columns = matrix(curve, into, out, k, at)
+        rows, columns = matrix(curve, into, out, k, q, at)
     of_force = int(curve == LoopCurve.KS or kind == GainOf.ACTUATOR)
     length = row_of(own[of_force, i], at[M], rows, columns)
     if kind == GainOf.ROW:
@@ -207,18 +237,23 @@ def own_gain(curve, i, into, out, k, own, kinds, at):
 
 
 @compiled
-def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
+def gain_of(curve, number, into, out, own, kinds, q, lever, of_plant, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
-    (m, c), p = into.shape, out.shape[1]
+    (m, c), p, z = into.shape, out.shape[1], lever.shape[1]
     kind, place = broken(curve, number, p, kinds), number
-    columns = m if curve == LoopCurve.GS else p
+    columns = q if curve == LoopCurve.GS else p
     rows = m if curve == LoopCurve.KS else p
-    if number < p:
-        matrix(curve, into, out, of[K], at)
+    levered = curve == LoopCurve.GS and z > 0
+    if levered:
+        rows = z
+        moved(into, out, of[K], q, lever, of_plant, at)
+        singular(at[M], rows, columns, at[V], sigma, True)
+    elif number < p:
+        matrix(curve, into, out, of[K], q, at)
         singular(at[M], rows, columns, at[V], sigma, True)
     else:
         place = 0
-        size = own_gain(curve, number - p, into, out, of[K], own, kinds, at)
+        size = own_gain(curve, number - p, into, out, of[K], own, kinds, q, at)
         if kind == GainOf.ROW:
             singular(at[M], 1, columns, at[V], sigma, True)
         else:
@@ -237,9 +272,16 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
             row = own[int(curve == LoopCurve.KS or at_actuator), number - p, a]
             of[U, a] = row * at[M, 0, 0].conjugate() * scale
     for a in range(p):
+        of[SEEN, a] = of[U, a]
+    if levered:
+        for a in range(p):
+            of[SEEN, a] = 0.0j
+            for b in range(z):
+                of[SEEN, a] += of[U, b] * lever[of_plant, b, a]
+    for a in range(p):
         total = 0.0j
         if curve == LoopCurve.GS:
-            for b in range(m):
+            for b in range(q):
                 total += at[FREE, a, b] * at[V, b, place]
         elif at_actuator:
             for b in range(m):
@@ -256,17 +298,23 @@ def gain_of(curve, number, into, out, own, kinds, at, of, sigma):
         if curve == LoopCurve.KS or at_actuator:
             for a in range(m):
                 total += of[U, a] * into[a, i]
-        of[LEFT, i] = total  # so far ũᵀV
+        elif levered:
+            for a in range(z):
+                for b in range(m):
+                    total -= of[U, a] * at[G, p + a, b] * into[b, i]
+        of[LEFT, i] = total  # so far ũᵀV, or -ũᵀN V
     sign = 1.0 if curve == LoopCurve.T else -1.0
     for b in range(p):
         total = 0.0j
-        if curve == LoopCurve.KS or at_actuator:
+        if curve == LoopCurve.KS or at_actuator or levered:
             for i in range(c):
                 total -= of[LEFT, i] * of[K, i] * at[US, i, b]
-        else:
+        if not (curve == LoopCurve.KS or at_actuator):
             for a in range(p):
-                total += sign * of[U, a] * at[S, a, b]
+                total += sign * of[SEEN, a] * at[S, a, b]
         of[X, b] = total
+    for a in range(z):
+        of[X, p + a] = -of[U, a] if levered else 0.0j
     for i in range(c):
         total = of[LEFT, i]
         if shared:
@@ -320,6 +368,7 @@ def levels(curves, which, v, loop, least, answers):
     terms, residues, T, d = loop.terms, loop.residues, loop.period, loop.delay
     limits, own, places = loop.limits, loop.rows, answers.place
     free_terms, free_residues = loop.free
+    q, lever, levered = free_residues.shape[4], loop.lever, loop.lever.shape[1] > 0
     k, matrix_room, vectors = of[K], at[M], at[V]
     p, numbers, m = outputs.shape[1], limits.shape[1], into.shape[0]
     out = np.full((count, most, curves.shape[1], numbers), -np.inf)
@@ -332,9 +381,11 @@ def levels(curves, which, v, loop, least, answers):
             if place < 0:
                 response(terms, residues, T, d, which[i], ω, chain, False, at, G)
             else:
-                for a in range(p):
+                for a in range(answers.held.shape[2]):
                     for b in range(m):
                         at[G, a, b] = answers.held[which[i], place, a, b]
+                for a in range(answers.free.shape[2]):
+                    for b in range(q):
                         at[FREE, a, b] = answers.free[which[i], place, a, b]
             closed(into, outputs, k, at)
             height, known = np.nan, False  # of S: ln of its largest gain, and of all others
@@ -345,7 +396,10 @@ def levels(curves, which, v, loop, least, answers):
                     response(free_terms, free_residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
                 rows, columns, top = p, p, height
                 if not of_s or np.isnan(height):
-                    rows, columns = matrix(curve, into, outputs, k, at)
+                    if curve == LoopCurve.GS and levered:
+                        rows, columns = moved(into, outputs, k, q, lever, which[i], at)
+                    else:
+                        rows, columns = matrix(curve, into, outputs, k, q, at)
                     top = abs(at[M, 0, 0])
                     if rows + columns > 2:
                         top = largest_gain(matrix_room, rows, columns)
@@ -356,7 +410,10 @@ def levels(curves, which, v, loop, least, answers):
                     out[i, j, c, 0] = top + level
                 elif top + level > least:
                     if not (of_s and known):
-                        matrix(curve, into, outputs, k, at)
+                        if curve == LoopCurve.GS and levered:
+                            moved(into, outputs, k, q, lever, which[i], at)
+                        else:
+                            matrix(curve, into, outputs, k, q, at)
                         singular(matrix_room, rows, columns, vectors, sigma, False)
                     for number in range(p):
                         if of_s and not known:
@@ -366,7 +423,7 @@ def levels(curves, which, v, loop, least, answers):
                     known = known or of_s
                 for number in range(p, numbers):
                     if limits[curve, number] < np.inf:
-                        size = own_gain(curve, number - p, into, outputs, k, own, loop.kinds, at)
+                        size = own_gain(curve, number - p, into, outputs, k, own, loop.kinds, q, at)
                         level = offset(curve, number, ω, chain, limits)[0]
                         out[i, j, c, number] = np.log(size) + level
     return out
@@ -390,15 +447,18 @@ def rows(curve, number, which, v, loop):
     value, slope : arrays (M,)
         ln of gain over bound, and its slope to ln v.
     to_kappa : array (M, n)
-    x, y, w : complex arrays (M, p), (M, m), (M, m)
-        Vectors of the slopes to the plant.
+    x, y, w : complex arrays (M, p + z), (M, m), (M, q)
+        Vectors of the slopes to the plant, w of GS.
     """
     at, of, g, sigma = room(loop)
     # Unpacked once: to hand all of them to a function costs as much as a row.
-    factors, values, channel, into, out, terms, residues, T, delay, limits, own, kinds, free = loop
-    count, (m, c), p = v.size, into.shape, out.shape[1]
+    factors, values, channel, into, out, terms, residues, T, delay = loop[:9]
+    limits, own, kinds, free, lever = loop[9:]
+    count, (m, c), p, q = v.size, into.shape, out.shape[1], free[1].shape[4]
+    wide = p + lever.shape[1]
     value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
-    x, sides = np.empty((count, p), np.complex128), np.zeros((2, count, m), np.complex128)
+    x, y = np.empty((count, wide), np.complex128), np.empty((count, m), np.complex128)
+    w = np.zeros((count, q), np.complex128)
     for j in range(count):
         before, of_gs, (ω, chain) = j - 1, curve[j] == LoopCurve.GS, warped(T, v[j])
         known = j > 0 and v[j] == v[before] and which[j] == which[before]
@@ -408,24 +468,28 @@ def rows(curve, number, which, v, loop):
             closed(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
-        σ, place = gain_of(curve[j], number[j], into, out, own, kinds, at, of, sigma)
+        σ, place = gain_of(
+            curve[j], number[j], into, out, own, kinds, q, lever, which[j], at, of, sigma
+        )
         level, rise = offset(curve[j], number[j], ω, chain, limits)
         for i in range(c):
             rise += (of[SHARE, i] * of[RATE, i]).real
-        for a in range(p):
+        for a in range(wide):
             x[j, a] = of[X, a]
             for b in range(m):
                 rise += (of[X, a] * at[DG, a, b] * of[Y, b]).real
-                if of_gs:
+            if of_gs:
+                for b in range(q):
                     rise -= chain * (of[X, a] * at[DFREE, a, b] * at[V, b, place]).real
         value[j], slope[j] = np.log(σ) + level, rise
         for a in range(g.size):
             to_kappa[j, a] = (of[SHARE, channel[a]] * g[a]).real
         for b in range(m):
-            sides[0, j, b] = of[Y, b]
-            if b < p or of_gs:
-                sides[1, j, b] = at[V, b, place]
-    return value, slope, to_kappa, x, sides[0], sides[1]
+            y[j, b] = of[Y, b]
+        if of_gs:
+            for b in range(q):
+                w[j, b] = at[V, b, place]
+    return value, slope, to_kappa, x, y, w
 
 
 @compiled

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, solve_sylvester
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.text import HZ
@@ -36,21 +36,59 @@ class Slopes(NamedTuple):
 
 
 @dataclass(frozen=True)
-class WiredPlant(StateSpace):
-    """A plant with its actuators and sensors.
+class ForcedPlant(StateSpace):
+    """A plant that disturbing forces move otherwise than u does.
 
     Attributes
     ----------
     mechanics : StateSpace
-        Without them.
+        What they move: the outputs, or without its sensors; then what counts, where that is given.
+    counted : StateSpace, optional
+        From u to the same.
     """
 
     mechanics: StateSpace = field(kw_only=True)
+    counted: StateSpace | None = field(default=None, kw_only=True)
 
     @classmethod
-    def of(cls, wired: StateSpace, mechanics: StateSpace) -> "WiredPlant":
-        """The matrices of `wired`."""
-        return cls(wired.A, wired.B, wired.C, wired.D, mechanics=mechanics)
+    def of(
+        cls, plant: StateSpace, mechanics: StateSpace, counted: StateSpace | None = None
+    ) -> "ForcedPlant":
+        """The matrices of `plant`."""
+        return cls(plant.A, plant.B, plant.C, plant.D, mechanics=mechanics, counted=counted)
+
+
+@dataclass(frozen=True)
+class OwnPorts:
+    """Which inputs and outputs of a wide plant are those of actuators and sensors: the first.
+
+    Attributes
+    ----------
+    outputs, inputs : int
+        p and m. Further inputs are disturbing forces (none: those of the actuators).
+    counted : int
+        Outputs after these that count; 0: the sensors', and S moves with a force as they do.
+    """
+
+    outputs: int
+    inputs: int
+    counted: int = 0
+
+    def drives(self, B: Array) -> tuple[Array, Array]:
+        """Columns (..., n, m) of u and (..., n, q) of disturbing forces."""
+        own, rest = B[..., : self.inputs], B[..., self.inputs :]
+        return own, rest if rest.shape[-1] else own
+
+    def readings(self, C: Array) -> tuple[Array, Array]:
+        """Rows (..., p, n) of the sensors, and these with what counts below (..., p + z, n)."""
+        return C[..., : self.outputs, :], C[..., : self.outputs + self.counted, :]
+
+    def apart(self, plant: StateSpace) -> ForcedPlant:
+        """A wide plant as what u moves, and beside it what disturbing forces move."""
+        (B, E), (C, whole) = self.drives(plant.B), self.readings(plant.C)
+        moved = strictly_proper(plant.A, E, whole)
+        counted = strictly_proper(plant.A, B, whole) if self.counted else None
+        return ForcedPlant.of(strictly_proper(plant.A, B, C), moved, counted)
 
 
 @dataclass(frozen=True)
@@ -179,11 +217,11 @@ class Wiring:
         return replace(self, sensor=Filters(**own))
 
     def around(self, plant: StateSpace) -> StateSpace:
-        """The plant (p x m, time in s) with its actuators and sensors, a `WiredPlant` with any."""
+        """The plant (p x m, time in s) with its actuators and sensors, a `ForcedPlant` with any."""
         if not self:
             return plant
         act, own, sen = self._parts(plant)
-        return WiredPlant.of(act.series(own).series(sen), plant)
+        return ForcedPlant.of(act.series(own).series(sen), plant)
 
     def _parts(
         self, plant: StateSpace, unit: float = 1.0

@@ -1,6 +1,7 @@
 """The scaled plant and its separate channels: time, force and state units in which every loop
 looks alike."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from ccd_casadi.lti.state_space import (
     state_scales,
     strictly_proper,
 )
-from ccd_casadi.lti.wiring import UNWIRED, Slopes, WiredPlant
+from ccd_casadi.lti.wiring import UNWIRED, ForcedPlant, OwnPorts, Slopes
 from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
@@ -213,8 +214,8 @@ class ScaledPlant:
     family : tuple of ScaledPlant
         The plant that a controller is designed on (free bodies: on their suspension), then those on
         which it must meet the bounds, too.
-    mechanics : ScaledPlant, optional
-        The plant without its actuators and sensors, where it has these.
+    mechanics, counted : ScaledPlant, optional
+        As a `ForcedPlant` has them, where disturbing forces move it otherwise than u does.
     """
 
     A: Array
@@ -231,6 +232,7 @@ class ScaledPlant:
     channels: tuple[ScaledChannel, ...] = ()
     family: "tuple[ScaledPlant, ...]" = ()
     mechanics: "ScaledPlant | None" = None
+    counted: "ScaledPlant | None" = None
 
     @property
     def free(self) -> bool:
@@ -256,14 +258,22 @@ class ScaledPlant:
         """The plant, force to displacement, time in s."""
         w0 = self.omega_0
         found = strictly_proper(w0 * self.A, w0 / self.force * self.B, self.C.copy())
-        own = self.mechanics
-        return found if own is None else WiredPlant.of(found, own.plant_si())
+        own, counted = self.mechanics, self.counted
+        if own is None:
+            return found
+        driven = None if counted is None else counted.plant_si()
+        return ForcedPlant.of(found, own.plant_si(), driven)
 
     def with_slopes_times(self, factors: Array) -> "ScaledPlant":
         """With each of its derivatives times a factor (n_θ, 1, 1)."""
-        own = self.mechanics
-        return replace(self, dA=factors * self.dA, dB=factors * self.dB, dC=factors * self.dC,
-                       mechanics=own and own.with_slopes_times(factors))  # fmt: skip
+        found = replace(self, dA=factors * self.dA, dB=factors * self.dB, dC=factors * self.dC)
+        return found.forced_as(lambda own: own.with_slopes_times(factors))
+
+    def forced_as(self, changed: "Callable[[ScaledPlant], ScaledPlant]") -> "ScaledPlant":
+        """With what disturbing forces move, and what counts, `changed`."""
+        both = self.mechanics, self.counted
+        mechanics, counted = (own and changed(own) for own in both)
+        return replace(self, mechanics=mechanics, counted=counted)
 
     def changes_si(self) -> list[tuple[Array, Array, Array]]:
         """∂A, ∂B and ∂C of `plant_si` to each parameter."""
@@ -302,6 +312,46 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
         found = _scaled(modal, M_K, bare)
         return replace(found, mechanics=_scaled(replace(modal, wiring=UNWIRED), M_K, True))
     return _scaled(modal, M_K, bare)
+
+
+def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
+    """Scale a plant that says where forces act or what counts.
+
+    Parameters
+    ----------
+    modal : ModalPlant
+        With further inputs and outputs.
+    M_K : float
+        N/m.
+    own : OwnPorts
+        Which are its actuators' and sensors'.
+
+    Returns
+    -------
+    ScaledPlant
+        Of these, in their unit of frequency, with what disturbing forces move beside it; without
+        the grid, the gains and the channels.
+    """
+    wide = _scaled(modal, M_K, True)
+    B, C = own.drives(modal.B)[0], own.readings(modal.C)[0]
+    leading = 2, np.array([[np.linalg.norm(B) * np.linalg.norm(C)]])
+    if (states := modal.states) is not None:
+        order, term = states.leading
+        leading = order, term[: own.outputs, : own.inputs]
+        if not leading[1].any():
+            A, B, C = states.system.A, states.system.B, states.system.C
+            leading = leading_term(A, own.drives(B)[0], own.readings(C)[0])
+    omega_0 = _unit_of_frequency(leading, M_K)
+    if not omega_0 > 0.0:
+        raise PlantError("input or output is zero: no mode is both driven and measured")
+    time = wide.omega_0 / omega_0
+    wide = replace(wide, A=time * wide.A, B=time * wide.B, dA=time * wide.dA, dB=time * wide.dB,
+                   omega_0=omega_0)  # fmt: skip
+    (B, E), (C, whole) = own.drives(wide.B), own.readings(wide.C)
+    (dB, dE), (dC, dwhole) = own.drives(wide.dB), own.readings(wide.dC)
+    moved = replace(wide, B=E, C=whole, dB=dE, dC=dwhole)
+    counted = replace(moved, B=B, dB=dB) if own.counted else None
+    return replace(wide, B=B, C=C, dB=dB, dC=dC, mechanics=moved, counted=counted)
 
 
 def _scaled(modal: ModalPlant, M_K: float, bare: bool) -> ScaledPlant:

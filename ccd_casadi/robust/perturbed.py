@@ -23,7 +23,7 @@ from ccd_casadi.codesign.survival import (
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import free_modal, plant_of
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, sampled
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sensitivity, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
@@ -39,13 +39,14 @@ from ccd_casadi.support.text import HZ
 
 def sampled_compliance(
     plant: StateSpace, held: StateSpace, K: StateSpace, places: Sequence[BreakPoint] = (), *,
-    decades: int = 6, per_decade: int = 60,
+    delay: float = 0.0, decades: int = 6, per_decade: int = 60,
 ) -> float:  # fmt: skip
     """Find the compliance of a sampled loop, max over ω <= π/T of σ_max(S(e^{jωT}) G(jω)).
 
     A sinusoidal force f beside the held one acts continuously: the outputs at the instants are
     S G f. The aliased effect of faster forces is not included. S is (1 + L)⁻¹ of the responses:
-    beside free bodies G is large and S small, and 1 - T would lose its digits.
+    beside free bodies G is large and S small, and 1 - T would lose its digits. Of a `ForcedPlant`
+    G is what disturbing forces move; where something else counts it moves by G_z f - G_u K S G f.
 
     Parameters
     ----------
@@ -55,6 +56,8 @@ def sampled_compliance(
         The plant with both, and the controller, in discrete time; their loop is stable.
     places : sequence of BreakPoint
         Of several sensors on one actuator: the first is whose error counts.
+    delay : float
+        s.
     decades, per_decade : int
         Of the grid below π/T, and its points in each.
 
@@ -65,11 +68,16 @@ def sampled_compliance(
     """
     end, S = np.pi / held.period, closed_loop(held, K).S
     near = root_flanks(np.concatenate([S.rates, plant.poles]))
+    forced, counted = getattr(plant, "mechanics", plant), getattr(plant, "counted", None)
+    driven = None if counted is None else sampled(counted, held.period, delay)
     grid = frequency_grid(end * 10.0**-decades, end, decades * per_decade, near)
 
     def gain(at: Array) -> Array:
-        errors = sensitivity(held.response(at) @ K.response(at))
-        moved = errors @ plant.response(at)
+        k, p = K.response(at), len(held.C)
+        errors, free = sensitivity(held.response(at) @ k), forced.response(at)
+        moved = errors @ free[:, :p]
+        if driven is not None:
+            moved = free[:, p:] - driven.response(at)[:, p:] @ k @ moved
         return sigma_max(np.array([places[0].output]) @ moved if places else moved)[None]
 
     return highest(gain, grid)[0][0]

@@ -290,7 +290,6 @@ def test_a_plant_without_ports_is_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("S_max = 2.5", "S_max = 2.5\ncompliance_max = 1e-4", "inner.compliance_max"),
         ("S_max = 2.5", 'S_max = 2.5\nminimise = "rms_error"', "inner.minimise"),
         ('structure = "sections"', 'structure = "h_infinity"', "full order"),
     ],

@@ -207,8 +207,10 @@ def limits_of(
     roots = (row[0].zeros, row[0].poles) if one else (np.empty(0, complex),) * 2
     beyond, growing = (tuple(part[part.real > outside * np.abs(part)].tolist()) for part in roots)
     free = None
-    if one and bounds.compliance_max is not None:
-        free = response_of(getattr(plant, "mechanics", plant))  # on which disturbing forces act
+    forced = getattr(plant, "mechanics", plant)  # on which disturbing forces act
+    alone = forced.B.shape[1] == len(forced.C) == 1  # what they move is S times it
+    if one and alone and bounds.compliance_max is not None:
+        free = response_of(forced)
     return Limits(name, bounds, row, free, period, beyond, ratio, integrator, unstable=growing)
 
 

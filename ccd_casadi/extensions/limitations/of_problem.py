@@ -169,7 +169,8 @@ def opposite_corners(
         return limits_of(uncertain.plant(point).plant_si(), bounds, sampling, integrator=integrator)
 
     found: list[Limits] = []
-    box, several = uncertain.box, uncertain.options[0].B.shape[1] > 1
+    box, model = uncertain.box, uncertain.plant(uncertain.nominal)
+    several = model.B.shape[1] > 1
     damping = np.array([name == "damping" for name in uncertain.names], bool)
     for option, point in uncertain.corners()[len(uncertain.options) :]:
         if option or several or (point > box[0])[damping].any():
