@@ -1,5 +1,6 @@
 """`compliance_max` where forces act and errors count: against the dynamic stiffness of the loop."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,8 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.lti.wiring import Filters, ForcedPlant, OwnPorts, Wiring
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust.perturbed import sampled_compliance
+from ccd_casadi.solve import main as solve
+from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.text import HZ
 
 RATE, DELAY, M0, M1, SPRING, ZETA = 10_000.0, 130e-6, 2.0, 0.4, 3e5, 0.03
@@ -429,3 +432,21 @@ def test_the_other_damping_and_code_are_judged_at_the_ports(tmp_path: Path) -> N
 def test_what_is_not_bounded_is_named(tmp_path: Path, options: str, words: str) -> None:
     with pytest.raises(CaseError, match=words):
         problem_in(tmp_path, options)
+
+
+@pytest.mark.slow
+def test_a_solved_case_is_verified_at_its_ports(tmp_path: Path) -> None:
+    """Behind an amplifier, with a bound that is active."""
+    (tmp_path / "plant.py").write_text(PLANT)
+    text = CASE.replace("OPTIONS", "").replace("MORE", "[actuator]\nlag_hz = 2000.0")
+    one = text.replace("lower = 0.7\nupper = 1.5\nstart = 1.0", "fixed = 1.0")
+    one = one.replace('"sections"', '"sections"\nstarts = 2\nbiquads = 0')
+    (tmp_path / "case.toml").write_text(one.replace("3e-5", "1.5e-5"))
+    out = tmp_path / "run"
+    options = [str(tmp_path / "case.toml"), "--out", str(out), "--workers", "1", "--no-report"]
+    assert solve(options) == ExitCode.DONE
+    result = json.loads((out / "result.json").read_text())
+    assert "compliance_max" in result["active"]
+    required = {one["name"]: one for one in result["requirements"]}
+    assert required["compliance_max"]["evidence"] == "proven"
+    assert result["compliance_max"] == pytest.approx(1.5e-5, rel=1e-4)
