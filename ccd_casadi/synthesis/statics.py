@@ -30,12 +30,15 @@ class StaticsOptions:
     apart : float
         Ratio of two frequencies just above those of integrators, between which K of a channel that
         integrates falls by as much; by less than its root: not every channel integrates.
+    rounding : float
+        Share of what a force moves at ω_low up to which what is left at rest is rounding.
     """
 
     differentiator: float = 0.1
     integrator: float = 1e-6
     resting: float = 1e-6
     apart: float = 4.0
+    rounding: float = 1e-9
 
 
 @dataclass(frozen=True)
@@ -171,7 +174,8 @@ def statics(
             rest = compliance(0.0 if ports is not None else above, at(above))
             return Statics(float(least), rest, np.inf, low, omega_low / HZ)
         at_rest = 0.0 if ports is None else compliance(0.0, at(options.resting * omega_low))
-        return Statics(np.inf, at_rest, np.inf, low, omega_low / HZ)
+        left = at_rest if at_rest > options.rounding * low else 0.0
+        return Statics(np.inf, left, np.inf, low, omega_low / HZ)
     K0 = at(0.0)
     gains = np.linalg.svd(K0, compute_uv=False)
     share = gains[0] / max(float(np.linalg.norm(at(bandwidth), 2)), 1e-300)

@@ -142,6 +142,18 @@ def closed(s: np.ndarray, K: StateSpace, C: np.ndarray) -> np.ndarray:
     return np.linalg.inv(Z + B @ K.at(s) @ C)
 
 
+def test_a_force_that_the_sensor_sees_moves_nothing_at_rest(tmp_path: Path) -> None:
+    """An integrator holds what it measures, wherever a force acts; what is left is rounding."""
+    problem, K = problem_in(tmp_path), controller()
+    (loop,) = member_loops(problem, problem.start, K)[:1]
+    ports = replace(loop.ports, counted=loop.plant.C, beyond=None)
+    found = statics(loop.plant, K, bandwidth=100.0, omega_low=HZ, ports=ports)
+    assert found.compliance == 0.0
+    assert "does not move the stage" in found.words
+    elsewhere = statics(loop.plant, K, bandwidth=100.0, omega_low=HZ, ports=loop.ports)
+    assert "beyond the sensors" in elsewhere.words
+
+
 @pytest.mark.parametrize("sensors", [1, 2])
 @pytest.mark.parametrize("options", ["", "numbers = true"])
 def test_compliance_is_that_of_the_dynamic_stiffness(
