@@ -39,11 +39,11 @@ from ccd_casadi.fixed_structure.certificate_curves import (
 )
 from ccd_casadi.fixed_structure.certificate_responses import (
     LoopResponses,
-    as_run,
+    LoopsAsRun,
     balanced_system,
     error_response,
+    loops_as_run,
     norms,
-    sampled,
 )
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
@@ -238,81 +238,104 @@ def judged(
     integrator: bool,
     options: JudgeOptions = JudgeOptions(),
 ) -> list[PlantFigures]:
-    """The figures of every plant's loop; the plants have matrices of one size."""
-    own = [balanced_system(plant) for plant in plants]
-    K = balanced_system(controller)
-    G, held = own, K
-    if sampling is not None:
-        G, held = [sampled(one, sampling) for one in own], as_run(K, sampling)
-    free = [balanced_system(getattr(plant, "mechanics", plant)) for plant in plants]
-    others = [getattr(plant, "counted", None) for plant in plants]
-    driven = [balanced_system(one) for one in others if one is not None]
-    if sampling is not None:
-        driven = [sampled(one, sampling) for one in driven]
-    if plants[0].period:  # what acts on it between its instants is not known
-        free = G
-    loops = [error_response(one, held) for one in G]
-    poles = [np.linalg.eigvals(S.A) for S in loops]
-    grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
-    found = [PlantFigures(False, one) for one in grown]
+    """Judge the loop of every plant; the plants have matrices of one size.
+
+    1. The loops are rebuilt, and their eigenvalues decide stability (`loops_as_run`).
+    2. Of stable ones S, KS, T and GS are evaluated on a grid through their poles and zeros.
+    3. Every peak is refined between its neighbours, and raised to what a Hamiltonian finds.
+
+    Parameters
+    ----------
+    plants, controller : sequence of StateSpace, StateSpace
+        SI.
+    bounds, sampling, integrator : Bounds, Sampling or None, bool
+        As of `certify`.
+    options : JudgeOptions
+
+    Returns
+    -------
+    list of PlantFigures
+    """
+    every = loops_as_run(plants, controller, sampling)
+    growth = every.growth
     # A pole as close to the axis as rounding may move it may lie on it. Eigenvalues
     # are those of the balanced matrix: a large gain of K does not move them in proportion.
-    sizes = [np.linalg.norm(matrix_balance(S.A)[0]) for S in loops]
-    good = [i for i, size in enumerate(sizes) if grown[i] < -options.rounding * size]
-    if not good:
-        return found
-    corner = 0.0
-    if bounds.weights is not None:
-        w = bounds.weights
+    sizes = [np.linalg.norm(matrix_balance(S.A)[0]) for S in every.S]
+    good = [i for i, size in enumerate(sizes) if growth[i] < -options.rounding * size]
+    found = [PlantFigures(False, one) for one in growth]
+    if good:
+        given = [plants[i] for i in good]
+        figures = _figures_of(every.only(good), given, bounds, integrator, options)
+        for i, own in zip(good, figures, strict=True):
+            found[i] = own
+    return found
+
+
+def _grid_of(loops: LoopsAsRun, bounds: Bounds, options: JudgeOptions) -> Array:
+    """The frequencies (P, k) through the poles and zeros of every loop, rad/s."""
+    corner, K = 0.0, loops.controller
+    if (w := bounds.weights) is not None:
         corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
-    of_K, grids = np.linalg.eigvals(held.A), []
-    zeros = [] if K.D.any() or K.period else [K.zeros(_size(K))]
-    for i in good:
-        nulls = own[i].rates_of(own[i].zeros(_size(own[i])))
-        roots = [poles[i], np.linalg.eigvals(G[i].A), of_K, nulls, *zeros]
-        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(own[i]), corner,
-                                  options.curves))  # fmt: skip
-    grid, rows = padded(grids), np.arange(len(good))
-    table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
-                          integrator, [driven[i] for i in good] if driven else ())  # fmt: skip
+    of_K, zeros = np.linalg.eigvals(loops.K.A), [] if K.D.any() or K.period else [K.zeros(_size(K))]
+    grids = []
+    for own, G, poles in zip(loops.plants, loops.G, loops.poles, strict=True):
+        nulls = own.rates_of(own.zeros(_size(own)))
+        roots = [poles, np.linalg.eigvals(G.A), of_K, nulls, *zeros]
+        grids.append(
+            grid_through(
+                roots, loops.sampling, bounds.omega_low, _size(own), corner, options.curves
+            )
+        )
+    return padded(grids)
+
+
+def _figures_of(
+    loops: LoopsAsRun, given: Sequence[StateSpace], bounds: Bounds, integrator: bool,
+    options: JudgeOptions,
+) -> list[PlantFigures]:  # fmt: skip
+    """The figures of stable loops; `given` has the plants as they were."""
+    grid, rows = _grid_of(loops, bounds, options), np.arange(len(given))
+    table = LoopResponses(loops.free, loops.G, loops.K, loops.sampling, bounds, integrator,
+                          loops.driven)  # fmt: skip
     if not integrator:
         grid = np.concatenate([_at_rest(table, grid[:, :1], options), grid], axis=1)
-    if len(own[0].C) > 1 and bounds.error is None:
+    if len(given[0].C) > 1 and bounds.error is None:
         grid, values = with_crossings(table, grid, options.curves)
     else:
         values = table.at(rows, grid)
-    low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
-    tops = peaks(table, grid, values, options.curves)
-    beyond_half_the_rate = np.zeros(len(good))
+    low = table.at(rows, np.full((len(rows), 1), bounds.omega_low))
+    tops, growth = peaks(table, grid, values, options.curves), loops.growth
+    beyond_half_the_rate = np.zeros(len(rows))
     if table.period is not None and table.free is not None and bounds.compliance_max is not None:
-        beyond, at = _compliance_beyond(table, [free[i] for i in good], options)
+        beyond, at = _compliance_beyond(table, loops.free, options)
         larger = beyond > tops["GS"][0]
         tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
         beyond_half_the_rate = np.where(larger, at, 0.0)
-    loops = [loops[i] for i in good]
-    inputs = [_at_the_actuator(loop, G[i], held) for loop, i in zip(loops, good, strict=True)]
-    for k, i in enumerate(good):
-        _raised(tops, k, loops[k], G[i], held, bounds, table, plants[i])
+    for k, (S, G, plant) in enumerate(zip(loops.S, loops.G, given, strict=True)):
+        _raised(tops, k, S, G, loops.K, bounds, table, plant)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
-    whole = loops
+    whole = loops.S
     if bounds.error is not None:
-        whole = [_entry(bounds.channels[bounds.error], loop) for loop in loops]
+        whole = [_entry(bounds.channels[bounds.error], S) for S in loops.S]
     norm, confirmed = norms(whole, table.period, *tops["S"])
-    channels: list[list[ChannelFigures]] = [[] for _ in good]
+    channels: list[list[ChannelFigures]] = [[] for _ in rows]
     for one in bounds.channels:
-        broken = inputs if one.place is BrokenAt.ACTUATOR else loops
+        broken = loops.S
+        if one.place is BrokenAt.ACTUATOR:
+            broken = [_at_the_actuator(S, G, loops.K)
+                      for S, G in zip(loops.S, loops.G, strict=True)]  # fmt: skip
         of_rows, certain = _rows(one, broken, table, grid, values, tops, options.curves)
         for k, figures in enumerate(of_rows):
             channels[k].append(figures)
             if one.bandwidth_ratio > 1.0:
                 bandwidth[k] = min(bandwidth[k], figures.bandwidth / one.bandwidth_ratio)
         confirmed &= certain
-    missing = np.full(len(good), np.nan)
+    missing = np.full(len(rows), np.nan)
     weighted = [tops.get(name, (missing, missing))[0] for name in ("weighted KS", "weighted T")]
-    for k, i in enumerate(good):
-        found[i] = PlantFigures(
+    return [
+        PlantFigures(
             stable=True,
-            stability=grown[i],
+            stability=growth[k],
             S_peak=float(norm[k]),
             S_peak_frequency=float(tops["S"][1][k]),
             S_low=float(low["S"][k, 0]),
@@ -325,12 +348,13 @@ def judged(
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
-            static_compliance=float(values["GS"][k, 0]) if driven or not integrator else 0.0,
+            static_compliance=0.0 if integrator and not loops.driven else float(values["GS"][k, 0]),
             low_compliance=float(low["GS"][k, 0]),
             confirmed=bool(confirmed[k]),
             channels=tuple(channels[k]),
         )
-    return found
+        for k in rows
+    ]
 
 
 def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Array:

@@ -6,8 +6,7 @@ so are confirmed by Hamiltonian matrices (`lti.norms`), which begin at them.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm, matrix_balance, schur
@@ -18,9 +17,6 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
 from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
-
-if TYPE_CHECKING:
-    pass
 
 
 def error_response(G: StateSpace, K: StateSpace) -> StateSpace:
@@ -81,6 +77,75 @@ def balanced_system(system: StateSpace) -> StateSpace:
     """The same in coordinates in which A, B and C are balanced."""
     A, B, C = balanced(system.A, system.B, system.C)
     return replace(system, A=A, B=B, C=C)
+
+
+@dataclass(frozen=True)
+class LoopsAsRun:
+    """Loops of one controller on plants of one size, as they run, in balanced coordinates.
+
+    Attributes
+    ----------
+    plants, G : sequence of StateSpace
+        Continuous; behind hold and delay where the loop is sampled.
+    controller, K : StateSpace
+        Continuous; as it runs.
+    free, driven : sequence of StateSpace
+        From disturbing forces; from u to what counts, empty where that is G's.
+    S : sequence of StateSpace
+        From references to errors.
+    poles : sequence of (n,) array
+        Of S.
+    sampling : Sampling or None
+        None: continuous.
+    """
+
+    plants: Sequence[StateSpace]
+    G: Sequence[StateSpace]
+    controller: StateSpace
+    K: StateSpace
+    free: Sequence[StateSpace]
+    driven: Sequence[StateSpace]
+    S: Sequence[StateSpace]
+    poles: Sequence[np.ndarray]
+    sampling: Sampling | None
+
+    @property
+    def growth(self) -> list[float]:
+        """Largest real part of each loop's poles, 1/s; where they are sampled largest |z| - 1."""
+        if self.sampling is None:
+            return [float(p.real.max()) for p in self.poles]
+        return [float(np.abs(p).max() - 1.0) for p in self.poles]
+
+    def only(self, kept: Sequence[int]) -> "LoopsAsRun":
+        """Some of them."""
+
+        def some(part: Sequence[StateSpace]) -> list[StateSpace]:
+            return [part[i] for i in kept] if part else []
+
+        return replace(
+            self, plants=some(self.plants), G=some(self.G), free=some(self.free),
+            driven=some(self.driven), S=some(self.S), poles=[self.poles[i] for i in kept],
+        )  # fmt: skip
+
+
+def loops_as_run(
+    plants: Sequence[StateSpace], controller: StateSpace, sampling: Sampling | None
+) -> LoopsAsRun:
+    """Close the loops of one controller on plants of one size, SI."""
+    own, K = [balanced_system(plant) for plant in plants], balanced_system(controller)
+    G, held = own, K
+    if sampling is not None:
+        G, held = [sampled(one, sampling) for one in own], as_run(K, sampling)
+    free = [balanced_system(getattr(plant, "mechanics", plant)) for plant in plants]
+    others = [getattr(plant, "counted", None) for plant in plants]
+    driven = [balanced_system(one) for one in others if one is not None]
+    if sampling is not None:
+        driven = [sampled(one, sampling) for one in driven]
+    if plants[0].period:  # what acts on it between its instants is not known
+        free = G
+    S = [error_response(one, held) for one in G]
+    poles = [np.linalg.eigvals(one.A) for one in S]
+    return LoopsAsRun(own, G, K, held, free, driven, S, poles, sampling)
 
 
 class Triangular:
