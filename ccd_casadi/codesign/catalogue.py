@@ -14,7 +14,8 @@ begin at what it has found.
 Where true values are cheap, exchanges give a combination to begin with (`exchange`): its design is
 judged before the first part is split, and cuts from there on if it is verified.
 
-Two parts are searched side by side, each by one worker, from what was known before both.
+Two parts are searched side by side, each by one worker, from what was known before both, unless the
+first would be a nearer place to begin the second at.
 
 Source: Land and Doig, Econometrica 28 (1960).
 """
@@ -159,6 +160,13 @@ def best_of_lists(
     def near(p: _Part) -> Solution | None:
         return min(known, key=lambda item: away(p.lists, _point(item)), default=None)
 
+    def nearer(p: _Part, other: _Part) -> bool:
+        """Whether a part is nearer to another one than to all that is known: from far away a search
+        near by may find nothing."""
+        gaps = [max(values[0] - other.lists[name][-1], other.lists[name][0] - values[-1], 0.0)
+                / width[name] for name, values in p.lists.items()]  # fmt: skip
+        return sum(gaps) < min(away(p.lists, _point(item)) for item in known)
+
     while open_:
         part = min(open_, key=place)
         least = np.inf  # a design that is not verified cuts nothing
@@ -183,6 +191,8 @@ def best_of_lists(
                 if not of_the_kind or other.bound >= least or other.lists == exchanged:
                     break
                 if other.count > 1 and in_full():
+                    break
+                if judge is not None and nearer(other, part):
                     break
                 some.append(other)
                 open_.remove(other)
