@@ -17,7 +17,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.extensions.feedforward.move_responses import (
-    learned,
+    learn,
     learning_gain,
     least_error,
     responses_of,
@@ -57,7 +57,7 @@ def shown(folder: Path) -> None:
     weaker = run.loop_on(replace(G, B=G.B / 1.05))
     count = len(found.responses[0].force)
     machine, model = (
-        responses_of(loop, profile, shape.orders, axis=0, samples=count).shaped(shape)
+        responses_of(loop, profile, shape.orders, axis=0, samples=count).with_taps(shape)
         for loop in (weaker, run.loop)
     )
     gain, floor = learning_gain(model, shape), least_error(machine, x, shape)
@@ -65,7 +65,7 @@ def shown(folder: Path) -> None:
     for _ in range(10):
         error = machine.tracking(x, shape)
         over.append(float(np.sqrt(np.mean(error**2))) / floor)
-        x = learned(x, error, gain, shape)
+        x = learn(x, error, gain, shape)
     print("  moves of a machine 5 % heavier, error over its floor:", *(f"{v:.3g}" for v in over))
 
 

@@ -24,7 +24,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from surrogates import design
-from surrogates.fitting import recalibrated
+from surrogates.fitting import recalibrate
 
 ROOT = Path(__file__).parents[1]
 CASES = (  # case, whether its surrogate has gradients, samples
@@ -43,7 +43,7 @@ def misses(outer: Outer, gradients: bool, points: int, seed: int) -> tuple[list[
     problem, bounds = sampler.problem, box(sampler.problem)
     samples = sampler.values(design("sobol", *bounds, points, seed))
     able = [sample for sample in samples if sample.feasible]
-    process = recalibrated(fit_bandwidth(problem, able, seed, gradients=gradients), seed)
+    process = recalibrate(fit_bandwidth(problem, able, seed, gradients=gradients), seed)
     fresh = [one for one in sampler.values(design("lhs", *bounds, FRESH, 99)) if one.feasible]
     mean, std = process.predict(np.array([one.theta for one in fresh]), return_std=True)
     sigma = np.maximum(std / process.band, 1e-7 * np.abs(mean))  # what the truth itself is good for
@@ -66,7 +66,7 @@ def main() -> None:
                 threadpool_limits(limits=1),
             ):
                 problem = problem_of(case)
-                outer = outer_of(Sampler(problem, store, workers)).prepared(seed)
+                outer = outer_of(Sampler(problem, store, workers)).prepare(seed)
                 found, band = misses(outer, gradients, points, seed)
             z = np.abs(found)
             shares = [[float((z <= k * b).mean()) for k in (1, 2, 3)] for b in (band, 1.0)]

@@ -30,7 +30,7 @@ from ccd_casadi.fixed_structure.design import DesignOptions, DesignSearch, _pool
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth, started
+from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth, start_at
 from ccd_casadi.plants.scaling import ScaledPlant
 
 sys.path += [str(Path(__file__).parents[1] / folder) for folder in (".", "tests")]
@@ -116,9 +116,9 @@ def peer(
             if time.process_time() - began >= seconds:
                 break
             used += 1
-            end = by_slsqp(problem, started(problem, kappa), began + seconds)
+            end = by_slsqp(problem, start_at(problem, kappa), began + seconds)
             if end is not None:
-                made = DesignSearch(problem, plants, required.sampling).designed(end, (), 1, 0)
+                made = DesignSearch(problem, plants, required.sampling).make_design(end, (), 1, 0)
                 if made.certified:
                     best = max(best, made.bandwidth / (2.0 * np.pi))
             if time.process_time() - began <= own:

@@ -34,10 +34,10 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.extensions.tolerances.answers import design_for_share, share_answer, tolerance_case
 from ccd_casadi.extensions.tolerances.machines import Plan, certified_share
-from ccd_casadi.extensions.tolerances.prices import buy, prices, scaled
+from ccd_casadi.extensions.tolerances.prices import buy, prices, scale_width
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import PoolOptions, Workers
@@ -119,13 +119,13 @@ def price_lists() -> None:
     for label, case in cases.items():
 
         def body(sampler: Sampler, label: str = label) -> None:
-            problem, design, _ = prepared(sampler.problem)
+            problem, design, _ = prepare_search(sampler.problem)
             theta = problem.start
             bandwidth, found = prices(problem, theta, design.kappa, None, lambda words: None)
             print(f"{label}: {bandwidth / HZ:.3f} Hz", flush=True)
             for price in found:
-                anew = [prepared(scaled(sampler.problem, price.name, factor))[1].bandwidth
-                        for factor in (0.0, 0.5)]  # fmt: skip
+                scaled = (scale_width(sampler.problem, price.name, factor) for factor in (0.0, 0.5))
+                anew = [prepare_search(one)[1].bandwidth for one in scaled]
                 cost, buys = ((best - bandwidth) / HZ for best in anew)
                 own = price.entry
                 slope = own["slope_hz"]
@@ -141,7 +141,7 @@ def widths() -> None:
     case = replace(case, robust=replace(case.robust, cost_per_percent={"resonance_shift": 0.4}))
 
     def body(sampler: Sampler) -> None:
-        problem, design, _ = prepared(sampler.problem)
+        problem, design, _ = prepare_search(sampler.problem)
         own, cost = sampler.of(problem), case.robust.cost_per_percent
         found = buy(own, problem.start, design.kappa, cost or {}, {}, print)
         print(found)

@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def commands() -> dict[str, tuple[str, str]]:
     """Every command that is installed: word -> the module of its `main`, and what it does."""
-    return COMMANDS | extensions.declared("commands")
+    return COMMANDS | extensions.collect_declared("commands")
 
 
 def _is_foreign(word: str) -> bool:

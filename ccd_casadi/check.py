@@ -5,7 +5,7 @@ import sys
 
 from ccd_casadi.support.command_line import ExitCode, command, option, program, run_folder
 from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import plural
 
 
 @command(
@@ -14,7 +14,7 @@ from ccd_casadi.support.text import counted
     needs=["ccd_casadi.codesign.result"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import plain_case, problem_of
     from ccd_casadi.cases.diagnosis import PlantReportOptions, diagnose, plant_report
@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if options.json:
         say(json_text(found))
     else:
-        words = template("templates/check.txt", counted=counted)
+        words = template("templates/check.txt", counted=plural)
         say(
             words.render(found, start=theta_words(found), shares=PlantReportOptions.shares).rstrip()
         )

@@ -37,7 +37,7 @@ def table(comparison: "Comparison") -> str:
     needs=["ccd_casadi.studies.comparison"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.case import case_to_toml
     from ccd_casadi.studies.compare_page import comparison_dict
     from ccd_casadi.studies.comparison import compare

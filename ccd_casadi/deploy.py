@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 
 def _delay(arguments: argparse.ArgumentParser) -> None:
-    """--delay or --delay-samples."""
+    """Add --delay and --delay-samples."""
     either = arguments.add_mutually_exclusive_group()
     words = "time from reading y to the new u, in s"
     either.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
@@ -210,7 +210,7 @@ def _summary(
 
 
 def needed_words(found: "Deployment") -> str:
-    """What the loop was designed for, or the least rate that it needs."""
+    """Describe what the loop was designed for, or the least rate that it needs."""
     if found.designed_for is not None:
         return f"designed for {_own(found.designed_for)}"
     if found.needed_hz is None:
@@ -219,7 +219,7 @@ def needed_words(found: "Deployment") -> str:
 
 
 def shortfall_words(found: "Deployment") -> str:
-    """What is not kept, why, and what to change."""
+    """Describe what is not kept, why, and what to change."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
     missed, needed = found.shortfalls[0], found.needed_hz

@@ -43,7 +43,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     measured = measured_case(options.case)
     if measured is not None:
-        return _measured(measured, options)
+        return _answer_measured(measured, options)
     case = load_case(options.case)
     if options.theta is None:
         start = ",".join(f"{each.name}={each.start:g}" for each in case.theta)
@@ -65,7 +65,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     return _print(found, options)
 
 
-def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
+def _answer_measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
     from ccd_casadi.support import extensions
@@ -80,7 +80,7 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
         raise CaseError(f"{case.path}: {words}, --omega-s-hz, --omega-t-hz and --begin-at")
     PROGRESS(f"{case.file}: {case.responses[0].words}")
-    found, made = measured_answer(case, seed=options.seed, tell=PROGRESS)
+    found, made = measured_answer(case, seed=options.seed, log=PROGRESS)
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
         from ccd_casadi.drawing.paint import write_page

@@ -19,7 +19,7 @@ from ccd_casadi.support.terminal import inform
     SCHEDULER, needs=["ccd_casadi.codesign.pareto"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.pareto import insight_dict, pareto_front
     from ccd_casadi.codesign.run import outer_of

@@ -57,7 +57,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         SampleStore(folder / "samples.sqlite") as store,
     ):
         outer = outer_of(Sampler(problem, store, workers, quiet=options.quiet))
-        outer = outer.resumed(folder, options.seed)
+        outer = outer.resume(folder, options.seed)
         sampler = outer.sampler
 
         def write(solution: "Solution") -> None:

@@ -30,7 +30,7 @@ PERCENT = real(0.0, 50.0, strict=True)
     *MOVE_OPTIONS, needs=["ccd_casadi.robust.study"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller

@@ -12,7 +12,7 @@ from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option
 from ccd_casadi.support.options import positive
 from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import plural
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.tables import Case
@@ -55,7 +55,8 @@ def summary(solution: "Solution") -> str:
 
 
 def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
-    """Which plant of a robust set the controller is made on, and what came of the others."""
+    """Describe which plant of a robust set the controller is made on, and the result on the
+    others."""
     if "design_at" not in robust:
         return []
     others = [
@@ -69,7 +70,7 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
 
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
-    """What J counts of the controller, and what was predicted of it."""
+    """Describe what J counts of the controller, and its prediction."""
     from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
     from ccd_casadi.reporting.facts import prediction_words
 
@@ -80,14 +81,14 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
         lines, reported = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
     else:
         of, reported = (
-            v.shown(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
+            v.format_value(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
         )
         lines = [f"{v.words:<13} {of} over the set", bandwidth]
     return [f"{lines[0]}   {prediction_words(result, reported)}".rstrip(), *lines[1:]]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
-    """On stderr: what is serious about a plant of the user's own, and what it is made of."""
+    """Print on stderr what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.findings import Severity, Topic, peak_words
     from ccd_casadi.inner_problem.problem import notes_of
     from ccd_casadi.plants.registry import model_named
@@ -123,7 +124,7 @@ def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -
 
 
 def of_workers(options: argparse.Namespace) -> Sequence[str]:
-    """What worker processes will need, and draw pages with."""
+    """Name the modules that worker processes will need, and draw pages with."""
     if options.scheduler:
         return ()
     return SAMPLING if options.no_report else (*SAMPLING, *DRAWING)
@@ -143,11 +144,11 @@ def of_workers(options: argparse.Namespace) -> Sequence[str]:
     early=of_workers,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
-    from ccd_casadi.codesign.result import resolved, write_run
+    from ccd_casadi.codesign.result import resolve, write_run
     from ccd_casadi.codesign.run import within
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.sampler import Sampler
@@ -155,7 +156,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     case = load_case(options.case)
     problem = problem_of(case)
-    plant_of(problem)  # a wrong plant is told before anything is written
+    plant_of(problem)  # a wrong plant is reported before anything is written
     folder = run_folder(options.case, options.out)
     name = options.formulation or usual_name(case, len(problem.names))
     formulation = formulation_of(case, name)
@@ -168,7 +169,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     with pool(options.scheduler, options.workers, PoolOptions.patience) as workers:
         with SampleStore(store) as samples:
             if options.resume:
-                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+                held = plural(samples.count(), "row") if samples.count() else "nothing yet"
                 inform(f"resuming      {store} holds {held}", sys.stderr)
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             minutes = options.budget or case.outer.minutes
@@ -181,7 +182,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         if not options.no_report:
             from ccd_casadi.reporting.solve_page import write_report
 
-            plant_case, solved = resolved(case, solution), solution.problem or problem
+            plant_case, solved = resolve(case, solution), solution.problem or problem
             write_report(folder, plant_case, solved, solution, workers)
             inform(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:

@@ -22,7 +22,7 @@ class Kernel(StrEnum):
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """What the likelihood determines, in the scaled units of the unit box.
+    """The parameters that the likelihood determines, in the scaled units of the unit box.
 
     Parameters
     ----------

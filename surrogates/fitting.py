@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError
 
 from surrogates.covariance import Hyperparameters, Kernel, log_likelihood
-from surrogates.gaussian_process import GaussianProcess, conditioned, loo_errors
+from surrogates.gaussian_process import GaussianProcess, condition_samples, loo_errors
 from surrogates.samples import Array, Samples, SurrogateFitError, checked
 
 Noise = ArrayLike | None
@@ -114,7 +114,7 @@ def fit(
             "an exact Gaussian process holds: take fewer samples, or leave gradients out"
         )
     parameters = estimate(samples, family, seed, starts, options)
-    return calibrated(conditioned(parameters, samples, family, uneven_noise(samples)))
+    return calibrate(condition_samples(parameters, samples, family, uneven_noise(samples)))
 
 
 def fit_outputs(
@@ -184,7 +184,8 @@ def estimate(
     by_component = samples.targets.reshape(-1, n)
 
     def search(starts: list[Array], limit: int, iterations: int) -> Array:
-        """Their best end by L-BFGS-B over the logarithms, on `limit` observations."""
+        """Search from the starts by L-BFGS-B over the logarithms, on `limit` observations; return
+        the best end."""
         rows = order[: max(limit // len(by_component), 2)]
         observed = by_component[:, rows].ravel()
         own_here = own[rows] if own.size else own
@@ -234,7 +235,7 @@ def _parameters(natural: Array) -> Hyperparameters:
     return Hyperparameters(natural[:-3], signal, noise, gradient_noise)
 
 
-def calibrated(
+def calibrate(
     process: GaussianProcess,
     misses: Array | None = None,
     options: CalibrationOptions = CalibrationOptions(),
@@ -275,12 +276,12 @@ def calibrated(
     return replace(process, band=max(1.0, *map(float, ratios)))
 
 
-def recalibrated(
+def recalibrate(
     process: GaussianProcess, seed: int = 0, options: CalibrationOptions = CalibrationOptions()
 ) -> GaussianProcess:
     """Return the process with the band of samples that are left out of fits, in parts.
 
-    Hyperparameters that were found with a sample know it: kept, as `calibrated` alone keeps them,
+    Hyperparameters that were found with a sample know it: kept, as `calibrate` alone keeps them,
     they make few samples much surer of themselves than fresh points bear out. It takes as many
     fits; the process as it is where it has so many observations that this matters little.
 
@@ -312,7 +313,7 @@ def recalibrated(
         part = checked(X[~out], Y[~out], process.lower, process.upper,
                        None if dY is None else dY[~out], noise)  # fmt: skip
         hyperparameters = estimate(part, process.kernel, seed, 1)
-        other = conditioned(hyperparameters, part, process.kernel, np.empty(0))
+        other = condition_samples(hyperparameters, part, process.kernel, np.empty(0))
         mean, deviation = other.predict(X[out], return_std=True)
         misses[out] = np.abs(Y[out] - mean) / deviation
-    return calibrated(process, misses, options)
+    return calibrate(process, misses, options)

@@ -38,7 +38,7 @@ class GaussianProcess:
         What the factorisation needed on its diagonal; closed-form leave-one-out errors.
     sample_noise, band : array, float
         Scaled variances (n,) of samples that differ in their noise, on top of the one in the
-        hyperparameters, else empty; factor on the deviation that `fitting.calibrated` found.
+        hyperparameters, else empty; factor on the deviation that `fitting.calibrate` found.
     """
 
     # Rounding leaves the predictive variance at noise-free samples anywhere within a few eps of
@@ -163,13 +163,13 @@ def condition(
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     own = np.empty(0) if noise is None else samples.noise_variances
-    return conditioned(hyperparameters, samples, Kernel(kernel), own)
+    return condition_samples(hyperparameters, samples, Kernel(kernel), own)
 
 
-def conditioned(
+def condition_samples(
     hyperparameters: Hyperparameters, samples: Samples, kernel: Kernel, sample_noise: Array
 ) -> GaussianProcess:
-    """As `condition`, of samples that are checked already."""
+    """Condition as `condition` does, on samples that are checked already."""
     mean, scale = samples.scaling
     unit, targets = samples.unit, samples.targets
     gradients = samples.dY is not None

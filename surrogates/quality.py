@@ -24,7 +24,7 @@ class ExtrapolationOptions:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """How far a point is from the samples, in the unit box, and what follows.
+    """The distance of a point from the samples, in the unit box, and what follows.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ class Quality:
 
     @property
     def at_point(self) -> tuple[float, float] | None:
-        """Where that point is a sample, the error there without it, in `unit` and in deviations."""
+        """The error at that point without it where it is a sample, in `unit` and in deviations."""
         return next(((m.error, m.sigmas) for m in self.around if m.at_point), None)
 
     @property
@@ -227,12 +227,14 @@ class Quality:
 
     @property
     def samples_are(self) -> str:
-        """How well the surrogate follows them; kinks and jumps are followed roughly at best."""
+        """The way in which the surrogate follows them; kinks and jumps are followed roughly at
+        best."""
         return "followed" if self.followed else f"{'poorly' if self.poor else 'roughly'} followed"
 
     @property
     def unsupported(self) -> str:
-        """Why the samples do not support the point of interest; nothing where they do."""
+        """The reason why the samples do not support the point of interest; nothing where they
+        do."""
         if self.extrapolates:
             return "; ".join(self.extrapolates)
         if self.poor:

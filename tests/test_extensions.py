@@ -12,10 +12,10 @@ from oracles.case_documents import QUICK_SECTIONS
 from oracles.sources import ROOT
 
 from ccd_casadi.support import extensions
-from ccd_casadi.support.extensions import SHIPPED, Extension, shipped
+from ccd_casadi.support.extensions import SHIPPED, Extension, read_shipped
 
 CASE = ROOT / "runs" / "two_mass.toml"
-NAMES = sorted(shipped())
+NAMES = sorted(read_shipped())
 SHOWN = ("formats", "rib_stage")  # in the suite; a process each
 IMPORTS = """
 import pkgutil, ccd_casadi
@@ -47,7 +47,8 @@ def solve_words(place: Path, *more: str) -> list[str]:
 
 def test_every_extension_of_a_message_is_there() -> None:
     for kind, of in SHIPPED.items():
-        there = {word: name for name, item in shipped().items() for word in getattr(item, kind)}
+        every = read_shipped().items()
+        there = {word: name for name, item in every for word in getattr(item, kind)}
         assert there == of
 
 
@@ -71,7 +72,7 @@ print(json.dumps(answers))
 )
 def test_what_a_removed_extension_has_is_answered_by_name(name: str, tmp_path: Path) -> None:
     needs = f"needs the extension {name}, which is not installed\n"
-    own, required = shipped()[name], list[tuple[list[str], str]]()
+    own, required = read_shipped()[name], list[tuple[list[str], str]]()
     for word in own.commands:
         for words in ([f"ccd_casadi.{word}"], ["ccd_casadi", word]):
             required.append((words, f"`{word}` {needs}"))
@@ -152,9 +153,9 @@ def test_another_distribution_adds_a_command(monkeypatch: pytest.MonkeyPatch) ->
     own = Extension(commands={"press": ("my_package.press", "press it")})
     point = SimpleNamespace(name="presses", load=lambda: own)
     monkeypatch.setattr(extensions, "entry_points", lambda group: [point])
-    extensions.installed.cache_clear()
+    extensions.read_installed.cache_clear()
     try:
         assert extensions.find("commands", "press") == own.commands["press"]
-        assert set(extensions.declared("commands")) == {*SHIPPED["commands"], "press"}
+        assert set(extensions.collect_declared("commands")) == {*SHIPPED["commands"], "press"}
     finally:
-        extensions.installed.cache_clear()
+        extensions.read_installed.cache_clear()

@@ -92,7 +92,7 @@ def loop_figures(loop: ClosedLoop, places: Sequence[BreakPoint] = ()) -> Sampled
     SampledFigures
         ‖S‖∞ is the largest of all places, ω_b that of the first.
     """
-    loops = [place.closed(loop) for place in places] or [loop]
+    loops = [place.close_loop(loop) for place in places] or [loop]
     parts = [sampled_figures(one.S) for one in loops]
     return replace(worst_figures(parts), bandwidth=parts[0].bandwidth)
 

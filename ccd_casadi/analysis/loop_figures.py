@@ -35,7 +35,7 @@ from ccd_casadi.synthesis.closed_loop import (
 
 @dataclass(frozen=True)
 class LoopFigureOptions:
-    """Numbers of steps.
+    """Numbers of the simulated steps.
 
     Attributes
     ----------
@@ -90,11 +90,12 @@ class ForceStep:
 
     @property
     def pair(self) -> str:
-        """What moves by what."""
+        """The output and the input of the step, as `y by u`."""
         return " by ".join(self.names)
 
     def entry(self, scalar: bool) -> dict[str, Any]:
-        """Of result.json; of several channels with the pair in words."""
+        """Write the step for result.json, with the pair in words where there are several
+        channels."""
         pair = {} if scalar else {"pair": self.pair}
         decay = {"decay_seconds": self.decay} if np.isfinite(self.decay) else {}
         return {"seconds": self.seconds, "plant": self.plant + 1, **decay, **pair}
@@ -151,8 +152,8 @@ def rest_time(loop: Loop, options: LoopFigureOptions = LoopFigureOptions()) -> f
 def step_figures(
     loop: Loop, bandwidth: float, options: LoopFigureOptions = LoopFigureOptions()
 ) -> tuple[float, float]:
-    """Of a unit step of each reference in turn the worst: the overshoot, and the last time outside
-    2 % in s (inf: it ends there)."""
+    """Compute the worst overshoot and the worst settling time to 2 % of unit steps of the
+    references, s; inf: the simulation ends before."""
     longest = HZ / bandwidth / options.per_period
     drives = loop.over_a_step(longest).B_r
     times, found = until_rest(loop, longest, rest_time(loop, options), drives, options)
@@ -226,7 +227,7 @@ def largest_force_step(
 
 
 def compliance_of(loops: Sequence[Loop], omega_low: float) -> tuple[float, float, float, float]:
-    """What disturbing forces move, the largest of all loops.
+    """Compute what disturbing forces move, the largest of all loops.
 
     Parameters
     ----------
@@ -241,7 +242,7 @@ def compliance_of(loops: Sequence[Loop], omega_low: float) -> tuple[float, float
         m/N, over frequency, at rest and at ω_low, and that in Hz.
     """
     at, rest = np.array([omega_low]), np.zeros(1)
-    low = max(float(sigma_max(one.moved(at))[0]) for one in loops)
+    low = max(float(sigma_max(one.force_responses(at))[0]) for one in loops)
     held = max(float(sigma_max(one.closed.GS.response(rest))[0]) for one in loops)
     return max(one.compliance for one in loops), held, low, omega_low / HZ
 
@@ -275,7 +276,7 @@ def measured_entry(
     loops: Sequence[tuple[Array, np.ndarray, Array]], controller: StateSpace, bandwidth: float,
     sensitivity_peak: float, options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:  # fmt: skip
-    """As `loop_entry`, of loops that are known on lines of frequency; without steps.
+    """Write the entry of `loop_entry` for loops that are known at frequencies alone, without steps.
 
     Between lines ln|L| and its phase are straight over ln ω.
 

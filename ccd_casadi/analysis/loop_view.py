@@ -12,7 +12,7 @@ from ccd_casadi.lti.frequency_grid import (
     refine_peak,
     resonant,
     root_flanks,
-    thinned,
+    thin,
 )
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import responses_of, sigma_max
@@ -34,14 +34,14 @@ class ViewOptions:
 
     @property
     def flanks(self) -> Array:
-        """In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot
-        is round."""
+        """Places in half widths of a resonance, in even steps of its phase: its circle in a Nyquist
+        plot is round."""
         return np.asarray(np.tan(np.radians(np.linspace(-86.0, 86.0, 27))))
 
 
 @dataclass(frozen=True)
 class Bounded:
-    """What a loop has to keep.
+    """The bounds that a loop has to keep.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class LoopView:
 
     @property
     def loop(self) -> Loop:
-        """The model's."""
+        """The loop of the model."""
         return self.loops[0]
 
     @property
@@ -216,7 +216,7 @@ def _of_others(roots: Sequence[np.ndarray], options: ViewOptions) -> Array:
     every = np.concatenate([*roots, np.empty(0, complex)])
     least = np.min(np.abs(every.real / every), initial=1.0)
     apart = max(options.other_plants * float(least), options.same)
-    return thinned(root_flanks(every, options.flanks) / HZ, apart)
+    return thin(root_flanks(every, options.flanks) / HZ, apart)
 
 
 def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:

@@ -17,7 +17,7 @@ from ccd_casadi.synthesis.closed_loop import classical_margins
 
 @dataclass(frozen=True)
 class LoopWarningOptions:
-    """From where on a loop is warned of.
+    """Thresholds of the warnings about a loop.
 
     Attributes
     ----------
@@ -84,8 +84,8 @@ def light_roots(
 def bandwidth_dip(
     loops: Sequence[Loop], bandwidth: float, options: LoopWarningOptions = LoopWarningOptions()
 ) -> float:
-    """By which factor the largest σ_max(S) is above the line ω/(√2 ω_b) on both sides of it, within
-    an octave; at least 1."""
+    """Compute the factor, at least 1, by which max σ_max(S) exceeds the line ω/(√2 ω_b) on both
+    sides of it, within an octave."""
     places = bandwidth * options.places
     return dip_of([np.linalg.norm(one.sensitivity(places), 2, (1, 2)) for one in loops], options)
 
@@ -196,8 +196,8 @@ def loop_warnings(
     again: SecondCrossover | None = None,
     options: LoopWarningOptions = LoopWarningOptions(),
 ) -> list[str]:  # fmt: skip
-    """What an engineer would not build, in words: ω_b that is held by something narrow, or rings,
-    or |L| that the controller takes above 1 again.
+    """Warn in words of what an engineer would not build: an ω_b that something narrow holds,
+    ringing, or a |L| that the controller raises above 1 again.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
     `dip`: as `bandwidth_dip` has it.

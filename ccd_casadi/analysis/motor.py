@@ -14,7 +14,7 @@ from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.plants.fixed_parameters import reparametrised
+from ccd_casadi.plants.fixed_parameters import reparametrise
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -160,7 +160,7 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
         k, _, i_peak = motor.at(mass)
         acceleration, why = k * i_peak / _largest(forces), "peak force"
         if np.real(_cycle(motion, acceleration, forces, mass).heat_share) > 1.0:
-            acceleration, why = _heated(motion, np.real(acceleration), forces, mass), "heat"
+            acceleration, why = _limit_heat(motion, np.real(acceleration), forces, mass), "heat"
     found = _cycle(motion, acceleration, forces, mass)
     reached = (
         ("velocity", found.profile.velocity, allowed.velocity),
@@ -211,7 +211,7 @@ def _peak(profile: Setpoint, h: Any, g: Any, far: float, options: MotionOptions)
 
 
 def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
-    """With this acceleration at most."""
+    """Compute the cycle with this acceleration at most."""
     profile, motor = setpoint(replace(motion.limits, acceleration=acceleration)), motion.motor
     mean = profile.squared_acceleration / (profile.durations.sum() + motion.dwell)
     largest = _largest(forces)
@@ -231,7 +231,7 @@ def _largest(forces: Array) -> Any:
     return found if np.real(found) > 0.0 else -found
 
 
-def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
+def _limit_heat(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
     """The acceleration below `most` with which the heat is all that is allowed.
 
     Newton's last step, at the root, gives its derivatives too.
@@ -312,7 +312,8 @@ def motion_at(
     motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None,
     options: MotionOptions = MotionOptions(),
 ) -> MotionAt:  # fmt: skip
-    """Of a plant with its rigid bodies free, square; `mass` of the motor is parameter `place` of θ.
+    """Compute the move of a square plant whose rigid bodies are free; `mass` of the motor is
+    parameter `place` of θ.
 
     Raises UserError where the output is held and no acceleration is given.
     """
@@ -433,7 +434,7 @@ def with_motion(
         ends = (motor.moving_mass[0], motor.moving_mass[-1])
         domain = (np.insert(domain[0], place, ends[0]), np.insert(domain[1], place, ends[1]))
     hardware, limited = _hardware(plant, own, names)
-    return reparametrised(
+    return reparametrise(
         plant, of, own.own, names=tuple(names), evaluate=own, hardware=hardware, domain=domain,
         constraint_names=(*plant.constraint_names, *limited),
         exact_hessian=plant.exact_hessian and not limited,

@@ -43,7 +43,7 @@ class MoveOptions:
 
 @dataclass(frozen=True)
 class Move:
-    """A simulated move.
+    """A simulated move, with its error and forces.
 
     Attributes
     ----------
@@ -96,7 +96,8 @@ class Move:
 
     @property
     def settling(self) -> float:
-        """How long after its end the error is outside `window` last, s; 0 where never."""
+        """Time in s after the end of the setpoint at which the error leaves `window` last; 0 where
+        it never does."""
         if np.isinf(self.settled):
             return np.inf
         outside = np.flatnonzero((self._size > self.window) & (self.time >= self.duration))
@@ -104,12 +105,12 @@ class Move:
 
     @property
     def rms_error(self) -> float:
-        """Over the move."""
+        """The RMS error over the move."""
         return float(self._rms(self._size))
 
     @property
     def peak_error(self) -> float:
-        """The largest."""
+        """The largest error."""
         return float(self._size.max())
 
     def last_error(self, share: float) -> float:
@@ -124,27 +125,27 @@ class Move:
 
     @property
     def peak_force(self) -> Array:
-        """Of each force (m,)."""
+        """The peak of each force (m,)."""
         return np.asarray(np.abs(self.force).max(axis=0))
 
     @property
     def peak_command(self) -> Array:
-        """Of each u (m,), N."""
+        """The peak of each command u (m,), N."""
         given = self.force if self.command is None else self.command
         return np.asarray(np.abs(given).max(axis=0))
 
     @property
     def rms_force(self) -> Array:
-        """Of each force over the move (m,)."""
+        """The RMS value of each force over the move (m,)."""
         return self._rms(self.force)
 
     @property
     def words(self) -> str:
-        """What takes part in it."""
+        """The kind of feedforward, in words."""
         return "with mass feedforward" if self.feedforward else "without feedforward"
 
     def until(self, seconds: float) -> "Move":
-        """Its first part."""
+        """Cut the move off after this time."""
         kept = self.time <= seconds
         names = ("time", "position", "error", "force", "command")
         cut = {name: part[kept] for name in names if (part := getattr(self, name)) is not None}
@@ -318,7 +319,8 @@ def counted_rows(loop: Loop, axis: int, closed: ClosedLoop) -> tuple[Array, Arra
 
 
 def _over(loop: Loop, ahead: Array, reference: Array, step: float) -> tuple[Array, Array]:
-    """What states, and the setpoint with its derivatives (n, 5), do to the states in a step (s).
+    """Discretise the loop over a step (s): A, and what the setpoint with its derivatives (n, 5)
+    adds.
 
     A continuous loop and the four integrators of its setpoint are one linear system.
     """

@@ -27,7 +27,7 @@ import numpy as np
 from ccd_casadi.analysis.motor import MotionAt, MotionOptions
 from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array, states
@@ -46,7 +46,8 @@ class MoveTimeOptions:
 
 
 class _Crossing:
-    """When the envelope of one plant's error crosses the window, s, and its slopes."""
+    """The time in s at which the envelope of one plant's error crosses the window, and its
+    slopes."""
 
     def __init__(
         self, G: StateSpace, K: StateSpace, r: Array, f: Array, window: float, period: float,
@@ -82,8 +83,8 @@ class _Crossing:
         self.period, self.k = period, k
         self.time = period * (len(r) - 1 + k)
 
-    def pulled(self) -> "_Crossing":
-        """With its slopes to the matrices, to the setpoint and to the force ahead."""
+    def with_slopes(self) -> "_Crossing":
+        """Add the slopes with respect to the matrices, the setpoint and the feedforward force."""
         there = self.shares > 0.0
         rate = float(self.shares[there] @ self.logs[1][there])
         scale = -self.period / rate
@@ -160,7 +161,7 @@ class MoveTime:
         gradient = np.zeros(len(kappa))
         for weight, each in zip(weights, found, strict=True):
             if weight > self.options.nothing:
-                back = each.pulled()
+                back = each.with_slopes()
                 slopes = [back.along(closed_loop(back.plant, K)) for K in moved]
                 gradient += weight * np.array(slopes)
         return float(np.log(value)), gradient / value
@@ -181,9 +182,9 @@ class MoveTime:
         for weight, each, plant in zip(weights, found, self.plants, strict=True):
             if not weight > self.options.nothing:
                 continue
-            back, G = each.pulled(), plant.plant_si()
+            back, G = each.with_slopes(), plant.plant_si()
             for i, (dA, dB, dC) in enumerate(plant.changes_si()):
-                moved = sampled(
+                moved = zoh(
                     StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D), T, tau
                 )
                 r, f = (signal.imag / size for signal in signals[i])
@@ -192,17 +193,17 @@ class MoveTime:
         return np.asarray(gradient / value)
 
     def times(self, kappa: Array) -> list[float]:
-        """When the envelope of each plant's error crosses the window, s."""
+        """Compute the times in s at which the envelope of each plant's error crosses the window."""
         return [each.time for each in self._crossings(np.asarray(kappa, float))]
 
-    def shown(self, value: float) -> str:
-        """In ms."""
+    def format_value(self, value: float) -> str:
+        """Format a time in ms."""
         return f"{1e3 * value:.5g} ms of move and settling"
 
     @cached_property
     def _sampled(self) -> tuple[StateSpace, ...]:
         hold = self.hold
-        return tuple(sampled(p.plant_si(), hold.period, hold.delay) for p in self.plants)
+        return tuple(zoh(p.plant_si(), hold.period, hold.delay) for p in self.plants)
 
     @cached_property
     def _time(self) -> Array:

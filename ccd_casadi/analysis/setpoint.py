@@ -32,7 +32,7 @@ class Setpoint:
 
     @property
     def duration(self) -> float:
-        """Of the move in s."""
+        """The duration of the move in s."""
         return float(self.durations.real.sum())
 
     @property
@@ -47,7 +47,7 @@ class Setpoint:
         """r and three derivatives (16, 4) where each interval begins, and at the end."""
         start = np.zeros((len(self.durations) + 1, 4), self.durations.dtype)
         for i, (span, snap) in enumerate(zip(self.durations, self.snaps, strict=True)):
-            start[i + 1] = _advanced(start[i], snap, np.array([span]))[:4, 0]
+            start[i + 1] = _advance(start[i], snap, np.array([span]))[:4, 0]
         start[-1, 1:] = 0.0  # what rounding left
         return start
 
@@ -57,7 +57,7 @@ class Setpoint:
         Analytic in the durations and snaps, which may be complex.
         """
         start, snaps = self._starts()[:-1].T[:, :, None], self.snaps[:, None]
-        return _advanced(start, snaps, self.durations[:, None] * np.atleast_2d(shares))
+        return _advance(start, snaps, self.durations[:, None] * np.atleast_2d(shares))
 
     def at(self, times: Array) -> Array:
         """r, ṙ, r̈, r⃛ and r⁗ (5, k) at times in s, at rest before the start and after the end."""
@@ -67,10 +67,10 @@ class Setpoint:
         place = np.clip(np.searchsorted(ends.real, t, side="right") - 1, 0, len(self.snaps))
         snaps = np.append(self.snaps, 0.0)
         snaps = np.where(t < 0.0, 0.0, snaps[place])
-        return _advanced(start[place].T, snaps, np.maximum(t - ends[place], 0.0))
+        return _advance(start[place].T, snaps, np.maximum(t - ends[place], 0.0))
 
 
-def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
+def _advance(state: Array, snap: float | Array, t: Array) -> Array:
     """r and four derivatives (5, ...) a time t after `state` (4, ...), with a constant snap."""
     r, v, a, j = state
     rows = (

@@ -7,7 +7,7 @@ import scipy
 
 @dataclass(frozen=True)
 class YieldOptions:
-    """Of a yield by random plants."""
+    """Numbers of a yield estimated by random plants."""
 
     confidence: float = 1.0 - 1e-6
 
@@ -54,7 +54,7 @@ def yield_bound(survived: int, draws: int, confidence: float = YieldOptions().co
 
 @dataclass(frozen=True)
 class Yield:
-    """How many fresh random plants survived.
+    """The share of fresh random plants that survived.
 
     Attributes
     ----------
@@ -76,12 +76,12 @@ class Yield:
 
     @property
     def _risk(self) -> float:
-        """That one set of draws is wrong."""
+        """The probability that one set of draws is wrong."""
         return 1.0 - YieldOptions().confidence
 
     @property
     def words(self) -> str:
-        """With the share rounded down."""
+        """The yield in words, its share rounded down."""
         percent = int(1e4 * self.least) / 100.0
         wrong = f"{self.turns * self._risk:.2g}".replace("e-0", "e-")
         return (
@@ -91,7 +91,7 @@ class Yield:
 
     @property
     def entry(self) -> dict[str, float]:
-        """Of result.json."""
+        """The entry of result.json."""
         return {
             "survived": self.survived, "draws": self.draws, "least": self.least,
             "confidence": 1.0 - self.turns * self._risk,

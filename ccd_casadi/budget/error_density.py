@@ -65,7 +65,7 @@ class QuadratureOptions:
     trusted: float = 1e-3
 
 
-def distrusted(disagreement: float, options: QuadratureOptions = QuadratureOptions()) -> bool:
+def has_lost_digits(disagreement: float, options: QuadratureOptions = QuadratureOptions()) -> bool:
     """Whether Lyapunov's equation has lost its digits, so that the integral counts."""
     return options.trusted < disagreement < np.inf
 
@@ -154,7 +154,7 @@ class Responses:
     given: np.ndarray | None = None
 
     def seen(self, kind: SourceKind) -> np.ndarray:
-        """What of a source the controller reads."""
+        """Compute the response of the controller's input to a source."""
         if kind in FORCES:
             return -self.moved
         return self.S @ self.ports.reference if kind is SourceKind.SETPOINT else -self.S
@@ -189,7 +189,7 @@ def responses(loop: Loop, hz: Array) -> Responses:
     plant, ports = loop.plant, loop.ports
     own = ports.drive is plant.B  # then what is known of the plant serves
     disturbed = plant if own else strictly_proper(plant.A, ports.drive, plant.C)
-    free = disturbed.swept(omega) if loop.sampling or loop.drive is not None else G
+    free = disturbed.sweep(omega) if loop.sampling or loop.drive is not None else G
     if G.shape[1] == G.shape[2]:
         S = sensitivity(G @ K)
         moved = S @ free
@@ -208,13 +208,13 @@ def responses(loop: Loop, hz: Array) -> Responses:
     if ports.beyond is None:
         return found
     of_d = strictly_proper(plant.A, ports.drive, ports.beyond)
-    return replace(found, beyond=(of_u(ports.beyond), of_d.swept(omega)))
+    return replace(found, beyond=(of_u(ports.beyond), of_d.sweep(omega)))
 
 
 def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:
     """f in Hz -> (S_e, S_u) as rows, of all channels together; one-sided, m²/Hz and N²/Hz."""
     if loop.sampling is not None and source.shaped:
-        return _folded(loop, source, loop.sampling.period)
+        return _fold(loop, source, loop.sampling.period)
 
     def at(hz: Array) -> Array:
         found = responses(loop, hz).of(source.kind)
@@ -224,9 +224,9 @@ def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:
     return at
 
 
-def _folded(loop: Loop, source: ErrorSource, T: float) -> Callable[[Array], Array]:
+def _fold(loop: Loop, source: ErrorSource, T: float) -> Callable[[Array], Array]:
     """The densities of the samples below half the rate, with all that is folded into them."""
-    model = process(loop, source).balanced()
+    model = process(loop, source).balance()
 
     def at(hz: Array) -> Array:
         z = np.expm1(1j * HZ * hz * T)
@@ -264,7 +264,9 @@ def panels(loop: Loop, source: ErrorSource, *, options: PanelOptions = PanelOpti
     return np.asarray(frequency_grid(low, high, points, *special, apart=1e-9) / HZ)
 
 
-def integrated(loop: Loop, source: ErrorSource, weight: Callable[[Array], Array]) -> Integral:
+def integrate_densities(
+    loop: Loop, source: ErrorSource, weight: Callable[[Array], Array]
+) -> Integral:
     """∫ w(f) S_e df and ∫ S_u df; rows S_e, S_u and w S_e. In Hz, m² and N²."""
     both = densities(loop, source)
 

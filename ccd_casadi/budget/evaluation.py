@@ -7,18 +7,24 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg.lapack import dgees, dtrsyl
 
-from ccd_casadi.budget.error_density import distrusted, integrate, integrated, panels, responses
+from ccd_casadi.budget.error_density import (
+    has_lost_digits,
+    integrate,
+    integrate_densities,
+    panels,
+    responses,
+)
 from ccd_casadi.budget.noise_process import (
     FORCES,
     Matrix,
     Process,
     average_gain,
     average_matrix,
-    disturbed,
     process,
+    process_of_plant,
 )
 from ccd_casadi.budget.sources import ErrorBudget, ErrorSource, SourceKind
-from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Loop, Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -49,10 +55,10 @@ def variances(loop: Loop, budget: ErrorBudget) -> Array | None:
 
 
 def of_source(loop: Loop, source: ErrorSource, window: float | None) -> Array:
-    """As `variances`, of one source in a stable loop."""
+    """Compute the variances of one source in a stable loop, as `variances` does."""
     average = np.nan
     if source.shaped:
-        model = process(loop, source).balanced()
+        model = process(loop, source).balance()
         P = Lyapunov(model.A, sampled=model.sampled).covariance(model.noise)
         error, force = np.trace(model.C @ P @ model.C.T), np.trace(model.F @ P @ model.F.T)
         force = np.inf if model.infinite_force else force + (model.V**2).sum()
@@ -60,10 +66,10 @@ def of_source(loop: Loop, source: ErrorSource, window: float | None) -> Array:
             M = average_matrix(model.A, window, loop.period)
             average = np.trace(model.C @ M @ P @ model.C.T)
     elif window is None:
-        error, force, _ = integrated(loop, source, np.zeros_like).value
+        error, force, _ = integrate_densities(loop, source, np.zeros_like).value
     else:
         gain = partial(average_gain, window=window, period=loop.period)
-        error, force, average = integrated(loop, source, gain).value
+        error, force, average = integrate_densities(loop, source, gain).value
     return np.array([error, average, force])
 
 
@@ -95,7 +101,7 @@ class ErrorVariance:
     @cached_property
     def open(self) -> Process:
         """The process of the filters without a controller."""
-        return disturbed(self.plant, self.filters, self.hold, self.order)
+        return process_of_plant(self.plant, self.filters, self.hold, self.order)
 
     def at(
         self, parts: Sequence[Matrix], M: Matrix, plants: Sequence[StateSpace] = ()
@@ -105,9 +111,9 @@ class ErrorVariance:
         A, B, C, D (n + 1, ·, ·) of the controller, and of it after a step ih along each of n
         parameters, with their `run_matrix` M; `plants`: k such steps of the plant.
         """
-        model = self.open.closed(M[0].real)
+        model = self.open.close(M[0].real)
         scale = model.scales()
-        model = model.transformed(scale)
+        model = model.transform(scale)
         equation, C = Lyapunov(model.A, sampled=model.sampled), model.C
         if not equation.stable:
             return None
@@ -116,8 +122,8 @@ class ErrorVariance:
         to_M = 2.0 * model.L.T @ X @ (after @ model.R.T + model.E @ model.W.T)
         value, slopes = float(np.sum(C.T * out)), [np.tensordot(M[1:].imag / COMPLEX_STEP, to_M, 2)]
         for G in plants:
-            moved = disturbed(G, self.filters, self.hold, self.order).closed(M[0].real)
-            moved = moved.transformed(scale)
+            moved = process_of_plant(G, self.filters, self.hold, self.order).close(M[0].real)
+            moved = moved.transform(scale)
             dA, dQ, dC = (part.imag / COMPLEX_STEP for part in (moved.A, moved.noise, moved.C))
             half = np.sum(X * (dA @ after.T)) + 0.5 * np.sum(X * dQ) + np.sum(dC.T * out)
             slopes.append(np.array([2.0 * half]))
@@ -175,14 +181,15 @@ class _ResponseChanges:
         return self.none, self._change("K", run, self.s), self.none
 
     def of_plant(self, G: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """And of a stepped plant."""
+        """Compute the changes of the responses with a stepped plant."""
         dG = dfree = self._change("free", G, self.free)
         if self.hold is not None:
-            dG = self._change("G", sampled(G, self.hold.period, self.hold.delay), self.s)
+            dG = self._change("G", zoh(G, self.hold.period, self.hold.delay), self.s)
         return dG, self.none, dfree
 
     def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
-        """By the imaginary parts of a system's matrices over the step."""
+        """Compute the change of a response from the imaginary parts of a system's matrices over the
+        step."""
         parts = (system.A, system.B, system.C, system.D)
         dA, dB, dC, dD = (np.imag(part) / COMPLEX_STEP for part in parts)
         if name not in self.known:
@@ -226,13 +233,13 @@ class Lyapunov:
 
     def covariance(self, Q: Array) -> Array:
         """P of a stable process, Q symmetric."""
-        return self._solved(self.inverse, Q, "N", "T")
+        return self._solve(self.inverse, Q, "N", "T")
 
     def adjoint(self, W: Array) -> Array:
         """X at a symmetric weight W."""
-        return self._solved(None if self.inverse is None else self.inverse.T, W, "T", "N")
+        return self._solve(None if self.inverse is None else self.inverse.T, W, "T", "N")
 
-    def _solved(self, inverse: np.ndarray | None, Q: Array, left: str, right: str) -> Array:
+    def _solve(self, inverse: np.ndarray | None, Q: Array, left: str, right: str) -> Array:
         if inverse is not None:
             Q = 2.0 * inverse @ Q @ inverse.T
         found, scale, _ = dtrsyl(self.T, self.T, -self.U.T @ Q @ self.U, left, right)
@@ -246,7 +253,7 @@ def _unsorted(real: float, imaginary: float) -> bool:
 
 @dataclass(frozen=True)
 class SourceFigures:
-    """What one source adds.
+    """The contribution of one source to error and force.
 
     Attributes
     ----------
@@ -300,7 +307,9 @@ class BudgetFigures:
     @property
     def by_integral(self) -> bool:
         """Whether that counts for a source, where Lyapunov's equation has no digits."""
-        return any(distrusted(item.disagreement) for item in self.sources if item.source.shaped)
+        return any(
+            has_lost_digits(item.disagreement) for item in self.sources if item.source.shaped
+        )
 
 
 def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
@@ -353,12 +362,12 @@ def _figures(loop: Loop, source: ErrorSource, window: float | None) -> SourceFig
     def weight(hz: Array) -> Array:
         return np.ones_like(hz) if window is None else average_gain(hz, window, loop.period)
 
-    whole = integrated(loop, source, weight)
+    whole = integrate_densities(loop, source, weight)
     if source.shaped:
         error, average, force = map(float, of_source(loop, source, window))
         ratio = whole.value[0] / error if error != 0.0 else 1.0
         disagreement = abs(float(ratio) - 1.0)
-        if distrusted(disagreement):
+        if has_lost_digits(disagreement):
             error, finite, average = map(float, whole.value)
             force = force if force == np.inf else finite
     else:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag, expm, matrix_balance
 
 from ccd_casadi.budget.sources import ErrorSource, SourceKind
-from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, delayed
+from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, with_delays
 from ccd_casadi.lti.ports import Ports
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -80,16 +80,16 @@ class Process:
 
     @property
     def noise(self) -> Matrix:
-        """cov w."""
+        """The covariance of w."""
         return self.Q + self.E @ self.E.T
 
-    def closed(self, M: Matrix) -> "Process":
-        """With this controller where there was none."""
+    def close(self, M: Matrix) -> "Process":
+        """Close the loop of an open process with a controller M."""
         LM, of_u = self.L @ M, M[: len(self.F)]
         return replace(self, A=self.A + LM @ self.R, E=self.E + LM @ self.W, F=of_u @ self.R,
                        V=of_u @ self.W)  # fmt: skip
 
-    def transformed(self, scale: Matrix) -> "Process":
+    def transform(self, scale: Matrix) -> "Process":
         """The same process in states x/scale."""
         return replace(
             self,
@@ -107,12 +107,12 @@ class Process:
         _, (scale, _) = matrix_balance(self.A.real, permute=False, separate=True)
         return np.asarray(scale)
 
-    def balanced(self) -> "Process":
-        """In the states of `scales`."""
-        return self.transformed(self.scales())
+    def balance(self) -> "Process":
+        """Transform the process to the states of `scales`."""
+        return self.transform(self.scales())
 
 
-def disturbed(
+def process_of_plant(
     G: StateSpace, sources: Sequence[ErrorSource], hold: Sampling | None, order: int,
     ports: Ports | None = None,
 ) -> Process:  # fmt: skip
@@ -124,9 +124,9 @@ def disturbed(
     """
     (p, n), m, T = G.C.shape, G.B.shape[1], 0.0 if hold is None else hold.period
     own = ports or Ports(G.B, G.C, np.eye(p), np.eye(p), np.eye(p))
-    force, _ = _joined(tuple(one for one in sources if one.kind in FORCES), own.drive.shape[1])
+    force, _ = _join(tuple(one for one in sources if one.kind in FORCES), own.drive.shape[1])
     rows = [tuple(map(tuple, part.tolist())) for part in (own.reference, own.wanted) if ports]
-    f, true = _joined(tuple(one for one in sources if one.kind not in FORCES), p, *rows)
+    f, true = _join(tuple(one for one in sources if one.kind not in FORCES), p, *rows)
     drive, driven = np.vstack([own.drive @ force.D, force.B]), n + len(force.A)
     G = StateSpace(
         np.block([[G.A, own.drive @ force.C], [np.zeros((driven - n, n)), force.A]]),
@@ -160,7 +160,7 @@ def disturbed(
 
 
 @lru_cache(64)  # every plant of a set has the same
-def _joined(
+def _join(
     sources: tuple[ErrorSource, ...], channels: int, reference: Rows = (), wanted: Rows = ()
 ) -> tuple[StateSpace, Matrix]:
     """The filters side by side, each in every channel, with their sum as the controller reads it;
@@ -224,7 +224,7 @@ def process(loop: Loop, source: ErrorSource) -> Process:
     if K.period:
         K, T = replace(K, A=K.A - np.eye(len(K.A))), None
     M = run_matrix((K.A, K.B, K.C, K.D), T)
-    found = disturbed(loop.plant, (source,), loop.sampling, len(K.A), loop.ports).closed(M)
+    found = process_of_plant(loop.plant, (source,), loop.sampling, len(K.A), loop.ports).close(M)
     if (force := loop.ports.force) is None:
         return found
     given = np.pad(force, [(0, 0), (0, len(found.A) - force.shape[1])])
@@ -238,7 +238,7 @@ def _held(G: StateSpace, hold: Sampling) -> StateSpace:
     (late, late_in), (early, early_in) = over(G.A, hold.period - rest), over(G.A, rest)
     gains = [np.zeros((n, m))] * whole + [late_in @ G.B, (early_in + late @ early_in) @ G.B]
     change = late + early + late @ early
-    found = delayed(change, gains if rest > 0.0 else gains[:-1], G.C, hold.period)
+    found = with_delays(change, gains if rest > 0.0 else gains[:-1], G.C, hold.period)
     found.A[n:, n:] -= np.eye(len(found.A) - n)
     return found
 

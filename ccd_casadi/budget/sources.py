@@ -91,7 +91,7 @@ class ShapedSpectrum:
 
     @property
     def relative_degree(self) -> int:
-        """How many more poles than zeros."""
+        """The number of poles beyond the zeros."""
         return sum(map(len, self.poles)) - sum(map(len, self.zeros))
 
     def at(self, hz: Array) -> Array:
@@ -213,7 +213,7 @@ class ErrorSource:
 
     @property
     def unit(self) -> str:
-        """Of the square root of the spectrum's integral."""
+        """The unit of the square root of the spectrum's integral."""
         if self.kind is SourceKind.FORCE:
             return "N"
         return "m/s^2" if self.of_acceleration else "m"

@@ -76,7 +76,7 @@ def names_of(table: PlacesTable) -> tuple[str, ...]:
 
 
 def places_of(table: PlacesTable) -> Places | None:
-    """Its places as plain values; None where the case has none."""
+    """Return the places of a table as plain values; None where the case has none."""
     if table == PlacesTable():
         return None
     values = {item.name: getattr(table, item.name) for item in fields(Places)}
@@ -121,7 +121,7 @@ def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
         given, entries = several(getattr(table, kind.value)), []
         for i, entry in enumerate(given, 1):
             place = f"budget.{kind.value}" + (f" {i}" if len(given) > 1 else "")
-            entries.append(_checked(entry, kind, place, folder, fail))
+            entries.append(_check(entry, kind, place, folder, fail))
         found[kind.value] = tuple(entries)
     if table.window_ms is not None and not any(found.values()):
         words = "has no spectrum to go with; add [budget.force] or another"
@@ -139,7 +139,7 @@ def error_budget(table: BudgetTable) -> ErrorBudget | None:
     return ErrorBudget(sources, None if table.window_ms is None else 1e-3 * table.window_ms)
 
 
-def _checked(
+def _check(
     entry: Mapping[str, Any], kind: SourceKind, place: str, folder: Path, fail: Fail
 ) -> Mapping[str, Any]:
     still = kind is not SourceKind.FLOOR_MOTION

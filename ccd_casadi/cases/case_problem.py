@@ -157,7 +157,7 @@ def _source(case: Case) -> PlantSource:
         places=positions,
         wiring=Wiring(filters_of(case.actuator), filters_of(case.sensor)),
         given=given,
-    ).pinned()
+    ).pin()
 
 
 def _inner_bounds(inner: InnerTable, structured: bool) -> InnerBounds:
@@ -244,7 +244,7 @@ def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:
 
 def _options(of: Mapping[str, Any]) -> Options:
     """The options of a plant, in an order of their own, as values that never change."""
-    return tuple(sorted((key, _frozen(value)) for key, value in of.items()))
+    return tuple(sorted((key, _freeze(value)) for key, value in of.items()))
 
 
 def _robust(table: RobustTable) -> RobustSet | None:
@@ -257,5 +257,5 @@ def _robust(table: RobustTable) -> RobustSet | None:
     return RobustSet(shift, table.shifts if shift else 1, table.damping, design)
 
 
-def _frozen(value: Any) -> Any:
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+def _freeze(value: Any) -> Any:
+    return tuple(map(_freeze, value)) if isinstance(value, list) else value

@@ -43,7 +43,7 @@ class KeyCheck:
     schema: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, value: Any) -> str | None:
-        """What is wrong with the value, None where nothing is."""
+        """Return what is wrong with the value, None where nothing is."""
         return self.test(value)
 
 
@@ -304,13 +304,14 @@ def key(
 
 
 def check_of(item: Field[Any]) -> KeyCheck:
-    """Its own, or the usual one of its type: a number above 0, a count, true or false, a text."""
+    """Return a key's own check, or the usual one of its type: a number above 0, a count, true or
+    false, a text."""
     kind: Any = (*get_args(item.type), item.type)[0]
     return item.metadata["check"] or USUAL[kind]
 
 
 def unit_of(item: Field[Any]) -> str:
-    """Its own, or that which the key's name ends with."""
+    """Return a key's own unit, or the one that its name ends with."""
     return item.metadata["unit"] or SUFFIXES.get(item.name[-3:], "")
 
 

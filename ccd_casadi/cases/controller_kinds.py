@@ -23,7 +23,7 @@ from ccd_casadi.synthesis.weights import Weights
 
 @dataclass(frozen=True)
 class KindOptions:
-    """What a case has where it gives no number."""
+    """Defaults of a case that gives no number."""
 
     shape: float = 1.1  # bound of the shape of S with a fixed structure
     disturbance: float = 10.0  # w_d over M_K

@@ -139,7 +139,7 @@ def diagnose(
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
                 here += plausibility_findings(problem, found)
                 here += loop_findings(problem, found, modal) + controller_findings(problem)
-                here += _unused(problem, plant, system)
+                here += _unused_parameters(problem, plant, system)
             findings += [replace(item, index=index) for item in here]
             facts.append(found)
         progress.advance()
@@ -155,7 +155,9 @@ def diagnose(
     return tuple(facts), tuple(findings)
 
 
-def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[CaseFinding]:
+def _unused_parameters(
+    problem: CoDesignProblem, plant: Plant, system: Mechanics
+) -> list[CaseFinding]:
     """Parameters that change no matrix, cost or constraint, from end to end of their bounds."""
     of_cost = (np.moveaxis(of, -1, 0) for of in hardware_slopes(plant, problem.start))
     slopes = [*system.derivatives, *of_cost]

@@ -124,8 +124,8 @@ def states_effort(problem: CoDesignProblem) -> bool:
     return not kind.as_designed or kind.bounds().weighted_level is not None
 
 
-def _searched(problem: CoDesignProblem) -> tuple[float, float]:
-    """From where to where, in Hz, a bandwidth can be meant."""
+def _searched_range(problem: CoDesignProblem) -> tuple[float, float]:
+    """Return the range in Hz in which a bandwidth can be meant."""
     inner = problem.inner
     low = max(inner.omega_low, inner.omega_T[0] / 4.0)
     return low / HZ, max(inner.omega_S[1], inner.omega_T[1]) / HZ
@@ -138,7 +138,7 @@ def suitable_effort(problem: CoDesignProblem, plant: ScaledPlant) -> float:
 
 def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, float]:
     """A third of the first resonance in Hz, within what [inner] searches, and M_K |G| there."""
-    low, high = _searched(problem)
+    low, high = _searched_range(problem)
     flexible = plant.natural[plant.natural > 0.0] / HZ
     aim = float(np.clip(flexible[0] / 3.0 if flexible.size else np.sqrt(low * high), low, high))
     gain = plant.gain  # the least of all directions: 0 where sensors share an actuator
@@ -152,7 +152,7 @@ def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, fl
 def _effort(
     problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant, options: FindingOptions
 ) -> list[str]:
-    low, high = _searched(problem)
+    low, high = _searched_range(problem)
     M_K, effort = problem.weights.M_K, facts.effort_hz
     if np.isfinite(effort) and low <= effort <= options.effort_margin * high:
         return []
@@ -181,7 +181,7 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     shown = (m for m in facts.modes if m.resonant and min(m.driven, m.measured) > least)
     first = next((mode.frequency_hz for mode in shown), np.nan)  # which compares with nothing
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
-    high = _searched(problem)[1]
+    high = _searched_range(problem)[1]
     if suits > options.mismatch * first:
         against = f"M_K suits {suits:.3g} Hz"
         if is_force(problem.spoken[1]):  # of a voltage 1/(b²) is not a mass
@@ -222,7 +222,7 @@ def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> l
 
 @dataclass(frozen=True)
 class MoveScale:
-    """What moves of machines stay below, in the unit of y and s."""
+    """Limits, in the unit of y and s, that moves of machines stay below."""
 
     stroke: float
     velocity: float

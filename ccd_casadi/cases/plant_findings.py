@@ -138,8 +138,8 @@ def controller_findings(problem: CoDesignProblem) -> list[CaseFinding]:
 
 
 def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
-    """Of each channel whose sensor a positive force moves to negative values, but for `nothing` of
-    what its modes could; of the directions that a design finds itself signs are known."""
+    """Warn of each channel whose sensor a positive force moves to negative values, by more than
+    `nothing` of what its modes could; a design that finds its own directions knows their signs."""
     p, m = len(modal.C), modal.B.shape[1]
     controller = problem.controller
     given = controller.channels if isinstance(controller, StructuredProblem) else ()
@@ -238,7 +238,7 @@ def _unstable_words(run: Sampling, growth_hz: float, S_max: float) -> list[str]:
 def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[CaseFinding]:
     """Warnings of a θ in a unit of mass or stiffness that stands in the matrix in that unit.
 
-    The entries' slopes tell: of a mass in g that is told in kg they are 0.001.
+    The entries' slopes show it: of a mass in g that is stated in kg they are 0.001.
     """
     found = []
     for key, units, slopes in (

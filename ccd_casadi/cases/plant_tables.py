@@ -88,7 +88,7 @@ def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
 
 
 def _check_of(option: inspect.Parameter) -> checks.Test:
-    """What its name or its annotation in the builder asks of an option."""
+    """Return the check of a builder's option, by its name or its annotation."""
     usual = (
         checks.names
         if option.annotation == Sequence[str]

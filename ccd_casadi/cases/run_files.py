@@ -51,7 +51,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 
 
 @contextmanager
-def damaged(place: str, words: str) -> Iterator[None]:
+def refuse_damaged(place: str, words: str) -> Iterator[None]:
     """Raise UserError in these words where the block finds that a file holds something else."""
     try:
         yield
@@ -90,7 +90,7 @@ def controller_of(path: Path, plant: ScaledPlant) -> StateSpace:
     table, m, p = read_json(path), plant.B.shape[1], plant.C.shape[0]
     found: dict[str, Array] = {}
     for key in "ABCD":
-        with damaged(f"{path}: {key}", "is not a matrix; make the run again"):
+        with refuse_damaged(f"{path}: {key}", "is not a matrix; make the run again"):
             found[key] = np.array(table[key], dtype=float)
             n = len(found["A"])
     for key, shape in {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}.items():
@@ -106,7 +106,7 @@ def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tup
     """
     path = folder / "controller.json"
     words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
-    with damaged(f"{path}: sections.kappa", f"{words}; name a run of this case"):
+    with refuse_damaged(f"{path}: sections.kappa", f"{words}; name a run of this case"):
         kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
         if kappa.shape != (len(structure.names),) or not (np.abs(kappa) < 200.0).all():
             raise ValueError("of another structure")

@@ -18,9 +18,9 @@ from ccd_casadi.cases.case_problem import plain_case, problem_of
 from ccd_casadi.cases.plant_tables import parse_theta
 from ccd_casadi.cases.run_files import (
     controller_of,
-    damaged,
     number_of,
     read_json,
+    refuse_damaged,
     sections_kappa,
     theta_of,
 )
@@ -139,9 +139,9 @@ class FinishedRun(NotebookHtml):
             return self.figures.bandwidth
         return loop_figures(closed_loop(*loop.as_run), loop.at).bandwidth
 
-    def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
+    def measure(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""
-        return _measured(self.problem, plant, controller, self.weights)
+        return _measure(self.problem, plant, controller, self.weights)
 
     def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
         """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
@@ -155,10 +155,11 @@ class FinishedRun(NotebookHtml):
         return to_control(plant, "plant"), to_control(controller, "controller")
 
 
-def _measured(
+def _measure(
     problem: CoDesignProblem, plant: ScaledPlant, controller: StateSpace, weights: Weights
 ) -> DesignFigures:
-    """Of several sensors on one actuator as `loop_figures`, S_low where the error counts."""
+    """Measure the loop as `loop_figures` does for several sensors on one actuator, with S_low where
+    the error counts."""
     low = problem.inner.omega_low
     found, places = (
         measure(plant, controller, weights, omega_low=low),
@@ -167,7 +168,10 @@ def _measured(
     if not places:
         return found
     whole = closed_loop(plant.plant_si(), controller)
-    own, at_low = loop_figures(whole, places), places[0].closed(whole).S.response(np.array([low]))
+    own, at_low = (
+        loop_figures(whole, places),
+        places[0].close_loop(whole).S.response(np.array([low])),
+    )
     return replace(found, sensitivity_low=float(abs(at_low[0, 0, 0])), bandwidth=own.bandwidth,
                    sensitivity_peak=own.sensitivity_peak,
                    sensitivity_peak_frequency=own.sensitivity_peak_frequency)  # fmt: skip
@@ -316,7 +320,7 @@ def _read_structured(
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; make the run again")
     problem = with_warm_start(problem, kappa)
-    figures = _measured(problem, scaled_plant(problem, theta), controller, problem.weights)
+    figures = _measure(problem, scaled_plant(problem, theta), controller, problem.weights)
     return {"problem": problem, "weights": problem.weights, "controller": controller,
             "figures": figures, "kappa": kappa}  # fmt: skip
 
@@ -346,7 +350,7 @@ def with_function(
     if "anchors" not in result:
         return problem  # of an earlier version
     words = "anchors, robust.set and seed are not those of a solve; make the run again"
-    with damaged(str(path), words):
+    with refuse_damaged(str(path), words):
         warm_starts, slower = (
             tuple(tuple(map(float, kappa)) for kappa in result.get(name, ()))
             for name in ("anchors", "error_anchors")
@@ -370,7 +374,7 @@ def _with_directions(
     if not isinstance(table, Mapping) or "channels" not in table:
         return problem
     own = {channel.name: channel for channel in structured.channels}
-    with damaged(f"{path}: sections.channels", "names no directions; make the run again"):
+    with refuse_damaged(f"{path}: sections.channels", "names no directions; make the run again"):
         channels = tuple(
             replace(
                 own.get(str(item["name"]), ChannelProblem(str(item["name"]), structured.structure)),

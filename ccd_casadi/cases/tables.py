@@ -32,7 +32,7 @@ class PlantTable:
 
     @property
     def name(self) -> str:
-        """Of the model, or of the function."""
+        """The name of the model, or of the function."""
         return self.model or name_of(self.function)
 
 
@@ -67,7 +67,7 @@ class Parameter:
 
     @property
     def table(self) -> dict[str, Any]:
-        """What a case file says of it."""
+        """The table of a case file that states it."""
         if len(self.values) == 1:
             return {"fixed": self.start, "unit": self.unit}
         if self.values:
@@ -264,7 +264,7 @@ class RobustTable:
 
     @property
     def share_words(self) -> str:
-        """What a design for a share is for; empty of the whole box."""
+        """The share that a design is for, in words; empty for the whole box."""
         if self.share is None:
             return ""
         sure = f"{100.0 * self.confidence:g} % confidence"

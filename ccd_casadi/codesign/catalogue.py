@@ -39,7 +39,7 @@ from ccd_casadi.sampling.sampler import IndependentSearch, Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import plural
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 
 Lists = dict[str, tuple[float, ...]]
@@ -62,8 +62,8 @@ class BranchOptions:
 
 @dataclass(frozen=True)
 class Node:
-    """What was searched: the values left of each list, status and J (inf: none was found), and
-    what J is made of in words."""
+    """A node that was searched: the values left of each list, status and J (inf: none was found),
+    and the terms of J in words."""
 
     lists: Lists
     status: str
@@ -78,7 +78,8 @@ class Node:
 
 @dataclass(frozen=True)
 class _Part:
-    """What is left of each list, a bound of its J, and where that was found, by name.
+    """A part that is left to search: the values of each list, a bound of its J, and the θ where
+    that was found, by name.
 
     `found`: of one combination that was searched, but not judged. `lost`: part of one where nothing
     was found, looked at where nothing else is left.
@@ -92,11 +93,11 @@ class _Part:
 
     @property
     def count(self) -> int:
-        """How many combinations it has."""
+        """The number of its combinations."""
         return int(np.prod([len(values) for values in self.lists.values()]))
 
 
-def restricted(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -> CoDesignProblem:
+def restrict(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -> CoDesignProblem:
     """The problem with each list as a range, or with a fixed parameter where it has one value."""
     units, start = problem.parameter_units, dict(zip(problem.names, problem.start, strict=True))
     ends = zip(problem.names, problem.lower, problem.upper, strict=True)
@@ -137,7 +138,7 @@ def best_of_lists(
              zip(problem.names, problem.lower, problem.upper, strict=True)}  # fmt: skip
 
     def away(lists: Lists, theta: Mapping[str, float]) -> float:
-        """How far a point is from a part, in shares of the ranges."""
+        """Return the distance of a point from a part, in shares of the ranges."""
         ends = [(values[0], theta[name], values[-1], width[name]) for name, values in lists.items()
                 if name in theta]  # fmt: skip
         return sum(abs(float(np.clip(v, low, high)) - v) / size for low, v, high, size in ends)
@@ -197,24 +198,24 @@ def best_of_lists(
                 some.append(other)
                 open_.remove(other)
         if judge is not None and part.found is not None:
-            each = sampler.of(restricted(problem, part.lists))
+            each = sampler.of(restrict(problem, part.lists))
             founds, judged = [judge(each, part.found)], judged + 1
         elif len(some) > 1:
             founds = sampler.side_by_side([
                 IndependentSearch(
-                    at if p.count == 1 else between, restricted(problem, p.lists), near(p),
+                    at if p.count == 1 else between, restrict(problem, p.lists), near(p),
                     traced=p.count == 1,
                 )
                 for p in some
             ])  # fmt: skip
             learn(founds)
         else:
-            each = sampler.of(restricted(problem, part.lists), traced=part.count == 1)
+            each = sampler.of(restrict(problem, part.lists), traced=part.count == 1)
             founds = [(at if part.count == 1 else between)(each, near(part))]
             learn(founds)
         lowered = 0.0
         for part, found in zip(some, founds, strict=True):
-            own, whole = restricted(problem, part.lists), part.count == 1
+            own, whole = restrict(problem, part.lists), part.count == 1
             found = replace(found, problem=found.problem or own)
             J = found.result.get("objective", np.inf)
             node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
@@ -242,8 +243,8 @@ def best_of_lists(
                 open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
         if exchanges and len(nodes) == 1 and not whole and np.isfinite(J):
             of = each.of(found.problem or own) if judge else each  # with its warm starts
-            exchanged, tried = _exchanged(problem, of, found, options)
-            own = restricted(problem, exchanged)
+            exchanged, tried = _exchange(problem, of, found, options)
+            own = restrict(problem, exchanged)
             first = at(sampler.of(own), found)
             learn([first])
             first = replace(first, problem=first.problem or own)
@@ -274,7 +275,7 @@ def best_of_lists(
     return replace(best, result=result | {"notes": notes})
 
 
-def _exchanged(
+def _exchange(
     problem: CoDesignProblem, sampler: Sampler, free: Solution, options: BranchOptions
 ) -> tuple[Lists, int]:
     """The combination that exchanges find from an optimum between the values, and how many they
@@ -293,13 +294,13 @@ def _in_the_time_left(
     problem = sampler.problem
     found = min((part for part in open_ if part.found), key=lambda p: p.bound, default=None)
     if found is not None and found.found is not None and judge is not None:
-        own = restricted(problem, found.lists)
+        own = restrict(problem, found.lists)
         solution = judge(sampler.of(own), found.found)
         return replace(solution, problem=solution.problem or own), found.lists
     best = min(known, key=lambda one: one.result["objective"], default=None)
     theta = dict(zip(problem.names, problem.start, strict=True))
     lists = _nearest(problem, theta if best is None else theta | _point(best), options)
-    own = restricted(problem, lists)
+    own = restrict(problem, lists)
     solution = at(sampler.of(own), best)
     learn([solution])
     if judge is not None and np.isfinite(solution.result.get("objective", np.inf)):
@@ -338,8 +339,8 @@ def _nearest(problem: CoDesignProblem, theta: Mapping[str, float], options: Bran
 
 
 def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: float) -> str:
-    """How far the search is, the bound on what is left, and how long searching it all takes, where
-    a person may wait for that."""
+    """Describe how far the search is, the bound on what is left, and how long searching it all
+    takes, where a person may wait for that."""
     J = min((node.objective for node in nodes if node.whole), default=np.inf)
     best = f"best J {J:.6g}" if np.isfinite(J) else "no combination searched yet"
     rest = sum(part.count for part in left if part.found is None)
@@ -347,7 +348,7 @@ def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: f
     there = f" with J from {bound:.6g}" if np.isfinite(bound) else ""
     seconds = (perf_counter() - began) / len(nodes) * rest
     more = f", {duration(seconds)} at most" if seconds <= BranchOptions.foreseen else ""
-    left_words = f"{rest} of {counted(count, 'combination')} left{there}{more}"
+    left_words = f"{rest} of {plural(count, 'combination')} left{there}{more}"
     return f"lists: {best}, {left_words if rest else 'none left'}"
 
 
@@ -358,7 +359,7 @@ def _point(solution: Solution) -> dict[str, float]:
 
 
 def _same(problem: CoDesignProblem, solution: Solution, share: float) -> float:
-    """By how much J may differ and count as the same: a share of its terms."""
+    """Return the amount by which J may differ and count as the same: a share of its terms."""
     cost, J = (float(solution.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
     hardware = problem.w1 * cost
     return share * (abs(hardware) + abs(J - hardware)) if np.isfinite(J) else 0.0
@@ -420,12 +421,12 @@ def _listed(
 
 
 def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
-    """What J is made of: the bandwidth or the error, at the hardware cost."""
+    """Describe the terms of J: the bandwidth or the error, at the hardware cost."""
     if "hardware_cost" not in result:
         return ""
     v, value = problem.figure, f"{result['bandwidth_hz']:.4g} Hz"
     if result.get(f"{v.entry}_of_set") is not None and v is not BANDWIDTH:
-        value = f"{v.words} {v.shown(result[f'{v.entry}_of_set'])}"
+        value = f"{v.words} {v.format_value(result[f'{v.entry}_of_set'])}"
     return f"{value} at {result['hardware_cost']:.4g} {problem.cost_unit}".strip()
 
 
@@ -442,11 +443,11 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         there, here = found["nodes"][0]["words"], _made_of(problem, result)
         figures = f" ({there} there, {here} here)" if there else ""
         free = f"; J is {far} the best with any value between them{figures}"
-    counts = f"{found['solved']} of {counted(found['combinations'], 'combination')} searched"
+    counts = f"{found['solved']} of {plural(found['combinations'], 'combination')} searched"
     if found["exchanged"]:
         counts += f", {found['exchanged']} evaluated at the theta of the first of these parts"
     if found["between"]:
-        counts += f", and {counted(found['between'], 'part')} with any value between them"
+        counts += f", and {plural(found['between'], 'part')} with any value between them"
     if found["cut"] and found["least_of_cut"] is not None:
         counts += f", {found['cut']} excluded: with any value between, the best found in their"
         counts += f" parts is J {found['least_of_cut']:.6g} or more"

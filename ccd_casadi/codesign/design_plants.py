@@ -42,7 +42,7 @@ class ContinuationOptions:
 def widen(
     sampler: Sampler, x: Array, options: ContinuationOptions = ContinuationOptions()
 ) -> tuple[Array, float]:
-    """From a design of the plant alone towards the whole set of a problem with one design plant.
+    """Widen a design for the plant alone towards the whole set of a problem with one design plant.
 
     x = (θ, ln ω_S, ln ω_T) and the share of the range held there.
     """
@@ -53,7 +53,7 @@ def widen(
         if held >= 1.0 or step < options.least_step:
             break
         share = min(1.0, held + step)
-        narrower = replace(problem, robust=problem.robust.scaled(share))
+        narrower = replace(problem, robust=problem.robust.scale(share))
         found = polish(sampler.of(narrower, traced=share == 1.0).truth, x)
         if found.acceptable:
             x, held, step = found.x, share, 2.0 * step
@@ -119,7 +119,7 @@ def order(item: Solution) -> tuple[int, int, float]:
 
 
 def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
-    """Why a search failed: where it looked, how near it came, what may be tried."""
+    """Describe why a search failed: where it searched, how near it came, what may be tried."""
     problem, words = sampler.problem, str(best.result["reason"])
     if best.verified is not None:
         figures = cast(VerifiedDesign, best.verified).design.figures
@@ -134,7 +134,7 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
 
 
 def search_words(problem: CoDesignProblem, thetas: int) -> str:
-    """Which controllers were looked for, and where."""
+    """Describe which controllers were searched, and where."""
     inner, robust = problem.inner, problem.robust
     ranges = (("omega_S", inner.omega_S), ("omega_T", inner.omega_T))
     box = [f"{name} {low / HZ:g} to {high / HZ:g}" for name, (low, high) in ranges]
@@ -152,7 +152,7 @@ def search_words(problem: CoDesignProblem, thetas: int) -> str:
 
 
 def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
-    """What may be tried where none was found; `share` of the range that was held, if known."""
+    """List what may be tried where none was found; `share` of the range that was held, if known."""
     ways = ["wider bounds of theta, omega_S_hz or omega_T_hz", "a larger S_max or S_low"]
     robust = problem.robust
     if robust is not None:

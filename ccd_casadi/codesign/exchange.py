@@ -139,7 +139,8 @@ def _exchanges(
     z: Values,
     allowed: Callable[[list[Values]], list[Values]],
 ) -> list[Values]:
-    """Those of one list that keep the constraints; where there are none, those of two."""
+    """List the exchanges within one list that keep the constraints; where there are none, those
+    within two."""
     moves = [(name, value) for name in z for value in _beside(listed[name], z[name])]
     single = allowed([z | {name: value} for name, value in moves])
     return single or allowed([z | dict(two) for two in combinations(moves, 2)

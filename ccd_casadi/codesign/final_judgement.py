@@ -39,7 +39,7 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.second_engine import (
     NOT_COMPARED,
     EngineComparison,
-    compared,
+    compare_engines,
     second_opinion,
 )
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
@@ -93,8 +93,8 @@ def judge_on_model(
 def second_on_weighted(
     problem: CoDesignProblem, theta: Sequence[float], design: Design
 ) -> EngineComparison:
-    """Of mixed sensitivity: the norm that γ was reached with on the plant of the design, and the
-    largest ‖S‖∞ and ‖GS‖∞ of its set."""
+    """Compare the judges of mixed sensitivity: the norm that γ was reached with on the plant of the
+    design, and the largest ‖S‖∞ and ‖GS‖∞ of its set."""
     figures = design.figures
     opinions = [
         second_opinion(plant, design.controller, weights=weights)
@@ -102,7 +102,7 @@ def second_on_weighted(
     ]
     claims = {"S": figures.sensitivity_peak, "GS": figures.compliance}
     worst = {name: max(opinions, key=lambda one: one.norms.get(name, inf)) for name in claims}
-    found = compared([
+    found = compare_engines([
         (opinions[0], {"weighted_loop": figures.certificate.norm}),
         *((worst[name], {name: claim}) for name, claim in claims.items()),
     ])  # fmt: skip
@@ -122,8 +122,8 @@ def plants_of_set(problem: CoDesignProblem, theta: Sequence[float]) -> list[Stat
 def second_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: "SectionsDesign"
 ) -> EngineComparison:
-    """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
-    plant that its certificate is of, as the loop runs."""
+    """Compare the judges of a fixed structure: ‖S‖∞, those of KS and T, and of GS for a continuous
+    loop, on every plant of its certificate, as the loop runs."""
     judged, K = design.certificate, design.controller
     if judged is None or K is None:
         return NOT_COMPARED
@@ -131,7 +131,7 @@ def second_on_set(
     wide = bool(problem.source.wiring or plant_of(problem).ports)
     alike = problem.sampling is None and not wide  # its GS and the second's
     of_GS, bounds = ("GS",) if alike else (), kind_of(problem).bounds()
-    return compared(
+    return compare_engines(
         (second_opinion(plant, K, problem.sampling, places=bounds.places),
          {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)}
          | {f"S of {one.name}": one.S_peak for one in figures.channels if bounds.places})
@@ -201,7 +201,7 @@ class OtherDamping:
 
     @property
     def words(self) -> str:
-        """What passes a bound by more than a hundredth with the other damping only, or nothing."""
+        """What exceeds a bound by more than a hundredth with the other damping only, or nothing."""
         other = "matrix" if self.kept == "ratio" else "ratio"
         where = f"on the set with the damping {other} kept instead of the {self.kept}"
         if not self.own:
@@ -217,7 +217,7 @@ class OtherDamping:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json's `robust`."""
+        """The entry of result.json's `robust`."""
         return {
             "damping_kept": self.kept,
             "damping_words": "; ".join(part for part in (KEPT[self.kept], self.words) if part),
@@ -225,10 +225,11 @@ class OtherDamping:
         }
 
 
-def survived(
+def judge_survival(
     problem: CoDesignProblem, loops: LoopsOffModel, design: "DesignFigures | SectionsDesign"
 ) -> tuple[Survival | None, RobustCheck | None]:
-    """What a certified loop survives and whether its set is kept, without contradicting each other.
+    """Find what a certified loop survives and whether its set is kept, without contradicting each
+    other.
 
     The ranges are evaluated at the ends of the set and where it is worst too, and the set at all
     places of the ranges.
@@ -296,7 +297,7 @@ def check_robust(problem: CoDesignProblem, loops: LoopsOffModel) -> RobustCheck 
 
 
 def _places(loops: LoopsOffModel, reach: float, shifts: int) -> list[float]:
-    """From end to end of a set, its own shifts among them."""
+    """List the places from end to end of a set, its own shifts among them."""
     places = [-reach]
     while places[-1] < reach:
         step = min(loops.step(places[-1]), 2.0 * reach / (RobustCheckOptions().shifts - 1))
@@ -317,7 +318,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     def judged(of: LoopsOffModel) -> SetCertificate:
         plants = []
         for place, gain in product(places, sorted(set(gains))):
-            modal = (of.at_ports or of).modal(place).driven(gain)
+            modal = (of.at_ports or of).modal(place).scale_input(gain)
             plants.append(scale_plant(modal, problem.weights.M_K, bare=True) if of.own is None
                           else scale_at_ports(modal, problem.weights.M_K, of.own))  # fmt: skip
         return certify(plants, of.controller, bounds, of.sampling)

@@ -12,7 +12,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 
 @dataclass(frozen=True)
 class SurrogateLimits:
-    """Up to where surrogates are fast: docs/development/method.md."""
+    """Limits up to which surrogates are fast: docs/development/method.md."""
 
     parameters: int = 12  # that a fit pays for
     samples: int = 1000  # inner problems of a plan over θ, some minutes
@@ -36,8 +36,8 @@ class Direct:
     tolerance: float = 1e-3
     box_points: int = 32
 
-    def sampled(self, variables: int) -> int:
-        """How many designs the plan has."""
+    def sample_count(self, variables: int) -> int:
+        """Return the number of designs of the plan."""
         return self.starts
 
 
@@ -102,7 +102,7 @@ def _usual(case: Case | None, parameters: int, sections: bool, listed: bool) -> 
     dear = listed or (case is not None and case.outer.direct_starts == 1)
     if (sections and dear) or slow_words(nested, parameters):
         return "direct"
-    fewer = nested.sampled(parameters) > lifted.sampled(parameters)
+    fewer = nested.sample_count(parameters) > lifted.sample_count(parameters)
     return "lifted" if sections and fewer else "nested"
 
 
@@ -129,7 +129,7 @@ def slow_words(
     if isinstance(formulation, Direct):
         return why
     if isinstance(formulation, Nested) and formulation.plan == "grid":
-        count = formulation.sampled(parameters)
+        count = formulation.sample_count(parameters)
         why = f"its grid is {count:.3g} inner problems" if count > limits.samples else ""
     if not why and parameters > limits.parameters:
         why = f"its surrogates are for {limits.parameters} at most"

@@ -13,7 +13,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
-from surrogates.fitting import calibrated
+from surrogates.fitting import calibrate
 
 BOUNDED = ("sensitivity_peak", "sensitivity_low", "compliance")  # whose logarithms are fitted
 
@@ -47,7 +47,7 @@ def interpolating(
         noise_variance=0.0, gradient_noise_variance=0.0,
     )  # fmt: skip
     ends = {"lower": process.lower, "upper": process.upper}
-    return calibrated(condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY))
+    return calibrate(condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY))
 
 
 def with_sample(
@@ -106,7 +106,7 @@ def surrogate_quality(
 
 
 def recommendation(qualities: Sequence[Quality]) -> str:
-    """What follows from the quality of surrogates.
+    """Recommend what follows from the quality of surrogates.
 
     Parameters
     ----------

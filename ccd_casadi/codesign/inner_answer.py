@@ -32,21 +32,21 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import least_from, prepare_search, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 @dataclass(frozen=True)
 class InnerAnswer:
-    """What the command `inner` prints and writes.
+    """The result of the command `inner`, as it is printed and written.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ class InnerAnswer:
 
 @dataclass(frozen=True)
 class InnerOptions:
-    """How an inner problem is searched.
+    """Options of the search of an inner problem.
 
     Attributes
     ----------
     seed, workers : int, Pool
         Of random choices, and the processes.
-    tell : function of str
+    log : function of str
         Takes lines of progress.
     point : tuple of float or None
         (ω_S, ω_T) in rad/s of a single mixed-sensitivity synthesis.
@@ -84,7 +84,7 @@ class InnerOptions:
 
     seed: int
     workers: Pool
-    tell: Tell = silent
+    log: Log = silent
     point: tuple[float, float] | None = None
     begin_at: Path | None = None
 
@@ -196,15 +196,15 @@ def structured_answer(
     if options.point is not None:
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
-    begin_at, tell, workers = options.begin_at, options.tell, options.workers
+    begin_at, log, workers = options.begin_at, options.log, options.workers
     head = head_of(problem, theta)
     required = replace(with_range(with_state(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
         kappa = sections_kappa(begin_at, structure_of(required))
         required = with_state(required, warm_starts=(kappa,))
-    required, made, worst = prepared(required, tell, workers, begin_at is not None)
+    required, made, worst = prepare_search(required, log, workers, begin_at is not None)
     fastest = made.bandwidth
-    required, made, least = least_from(required, theta, made, tell, workers)
+    required, made, least = least_from(required, theta, made, log, workers)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
@@ -220,7 +220,7 @@ def structured_answer(
     on_box = DesignOnBox(required, theta, made)
     if worst is None or least is not None:
         worst = on_box.worst(workers=workers)[0]
-    wide, checked, proof = on_box.judged(worst, workers)
+    wide, checked, proof = on_box.judge(worst, workers)
     assert made.controller is not None
     second = second_on_set(required, theta, made)
     passed = wide.passed and not proof.refuted and second.agrees is not False

@@ -64,7 +64,7 @@ class Proposal:
     gain: float
 
 
-def proposed(
+def propose_step(
     problem: CoDesignProblem,
     models: Sequence[Evaluate],
     at: JointPoint,
@@ -144,7 +144,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
         middle = (self.middle - lower) / self.width
-        uncertain = self.uncertain(middle, self.known(middle))
+        uncertain = self.uncertain(middle, self.known_mechanics(middle))
         self.scenarios = known or uncertain.corners()
         self.first = uncertain.plants(self.scenarios[:1])[0]
         self.unit = -problem.w2 * place.bandwidth
@@ -169,7 +169,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         return self.at(self.start)
 
     def place(self, x: Array) -> JointPoint:
-        """That of x."""
+        """Return the point of x: θ, κ in SI and ω_b."""
         z, scaled, tau = self.parts(x)
         loops = self.first_loops
         kappa = loops.structure.in_units(scaled, loops.plants.omega_0, loops.plants.force)
@@ -177,7 +177,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         omega_b = float(np.exp(tau) * loops.plants.omega_0)
         return JointPoint(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
 
-    def adapted(self, steps: int | None = None) -> tuple[JointPoint, float]:
+    def adapt(self, steps: int | None = None) -> tuple[JointPoint, float]:
         """The middle after a few steps of the controller alone, and J there with the penalty of
         the violation that is left; infinite where a loop is unstable."""
         options, steps = self.options, self.options.adapting_steps if steps is None else steps
@@ -204,7 +204,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def known(self, z: Array) -> list[Mechanics]:
+    def known_mechanics(self, z: Array) -> list[Mechanics]:
         """The plant and its options at z, as the models know them."""
         return [model(tuple(self.theta(z).tolist())) for model in self.models]
 
@@ -213,7 +213,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         return uncertain_plant(self.problem, tuple(self.theta(z).tolist()), known)
 
     def plants(self, z: Array, known: Sequence[Mechanics]) -> list[ScaledPlant]:
-        """Those of the set there, in the units of its first one in the middle."""
+        """Return the plants of the set at z, in the units of its first one in the middle."""
         share = self.width[:, None, None]
         return [
             in_units_of(one.with_slopes_times(share), self.first)
@@ -221,11 +221,11 @@ class JointModel(TrustRegionModel[JointLoops]):
         ]  # fmt: skip
 
     def loops(self, z: Array) -> LoopProblem:
-        """Those with these plants."""
+        """Return the loops with the plants at z."""
         structured = structured_of(self.problem)
         return problem_for(
-            self.plants(z, self.known(z)), structure_of(self.problem), bounds_of(self.problem),
-            structured.sampling, structured.frequencies,
+            self.plants(z, self.known_mechanics(z)), structure_of(self.problem),
+            bounds_of(self.problem), structured.sampling, structured.frequencies,
         )  # fmt: skip
 
     def loops_beside(self, here: Iterate[JointLoops]) -> list[LoopProblem]:
@@ -237,10 +237,10 @@ class JointModel(TrustRegionModel[JointLoops]):
 
     def _loops_beside(self, here: Iterate[JointLoops]) -> list[LoopProblem]:
         z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
-        known, found = self.known(z), []
+        known, found = self.known_mechanics(z), []
         for step in HessianOptions.parameter_step * np.eye(len(z)):
             moved = (
-                self.known(z + step)
+                self.known_mechanics(z + step)
                 if self.curved_plants
                 else [to_first_order(one, self.width * step) for one in known]
             )
@@ -248,7 +248,7 @@ class JointModel(TrustRegionModel[JointLoops]):
         return found
 
     def at(self, x: Array) -> Iterate[JointLoops] | None:
-        """With every loop stable, and masses that are positive to first order."""
+        """Evaluate x, provided that every loop is stable and masses are positive to first order."""
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
         try:
@@ -266,8 +266,8 @@ class JointModel(TrustRegionModel[JointLoops]):
         data = JointLoops(loops, kappa, tau, found)
         return Iterate(x, cost / self.unit - worth, slope, violation, data)
 
-    def ended(self, here: Iterate[JointLoops], there: Iterate[Any]) -> bool:
-        """Where the last trials gain little of what all have."""
+    def has_ended(self, here: Iterate[JointLoops], there: Iterate[Any]) -> bool:
+        """Decide whether the last trials gain little of what all have gained."""
         if not self.ends_early or self.beginning is None:
             return False
         merits, options = self._merits, self.options

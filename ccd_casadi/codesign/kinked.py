@@ -84,7 +84,8 @@ def descend(
     ended: Sequence[tuple[Array, float]] = (),
     options: PeakDescentOptions = PeakDescentOptions(),
 ) -> Array:
-    """From a certified design to the nearest optimum of the true problem; the best x found.
+    """Descend from a certified design to the nearest optimum of the true problem; return the best x
+    found.
 
     At most `steps` designs are evaluated, and none more once it is in the basin of an optimum
     (x, J) where others `ended`. Returns the start where it is not certified.
@@ -93,7 +94,7 @@ def descend(
     settled = options.settled if settled is None else settled
     model = _Peaks(truth, ended, options)
     here = model.at(model.box.shares(x))
-    if here is None or model.ended(here, here):
+    if here is None or model.has_ended(here, here):
         return x
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
     radius = Radius(options.first_radius, options.least_radius, options.largest_radius)
@@ -146,10 +147,10 @@ class _Peaks(TrustRegionModel[_Design]):
         margin = self.curvature * radius**2 * shelf if shelf.any() else None
         return Rows(found.g, found.jacobian, margin=margin)
 
-    def learnt(
+    def learn(
         self, H: Array, here: Iterate[_Design], there: Iterate[_Design], step: Step, radius: float
     ) -> Array:
-        """With the change of the Lagrangian's gradient."""
+        """Update the Hessian by the change of the Lagrangian's gradient."""
         self.curvature = _curvature(here, there, self.curvature, self.options)
         after = there.gradient.copy()
         for value, tag in zip(step.multipliers, here.data.tags, strict=True):
@@ -161,8 +162,8 @@ class _Peaks(TrustRegionModel[_Design]):
         before = here.gradient + here.data.jacobian.T @ step.multipliers
         return damped_bfgs(H, there.x - here.x, after - before)
 
-    def ended(self, here: Iterate[_Design], there: Iterate[_Design]) -> bool:
-        """In the basin of an end that is known, and no lower."""
+    def has_ended(self, here: Iterate[_Design], there: Iterate[_Design]) -> bool:
+        """Decide whether the step is in the basin of an end that is known, and no lower."""
         return any(
             there.value >= J and np.abs(there.x - z).max() <= self.options.basin
             for z, J in self.known
@@ -172,7 +173,7 @@ class _Peaks(TrustRegionModel[_Design]):
 def _curvature(
     here: Iterate[_Design], there: Iterate[_Design], before: float, options: PeakDescentOptions
 ) -> float:
-    """How far a peak below -3 dB may depart from its slope, ln per (share of the box)².
+    """Estimate how far a peak below -3 dB may depart from its slope, ln per (share of the box)².
 
     After a step twice what it showed, but at least a quarter of what was assumed `before`; four
     times that where such a peak was lost.
@@ -193,7 +194,7 @@ def _curvature(
 def polish(
     truth: TrueQuantities, x: Array, options: PeakDescentOptions = PeakDescentOptions()
 ) -> TrueDesign:
-    """From a design nearly optimal to the nearest stationary point of the true problem.
+    """Polish a nearly optimal design to the nearest stationary point of the true problem.
 
     A descent past kinks, every peak of S a constraint (some ten designs where IPOPT
     takes a hundred), then Newton's steps as long as the residual falls, where no other peak is

@@ -51,8 +51,8 @@ class Lifted:
     kernel: str = "matern52"
     box_points: int = 32
 
-    def sampled(self, variables: int) -> int:
-        """How many designs the plan has."""
+    def sample_count(self, variables: int) -> int:
+        """Return the number of designs of the plan."""
         return self.points or 6 * variables
 
 
@@ -84,7 +84,7 @@ def solve_lifted(
     """
     problem = sampler.problem
     bounds, n = lifted_bounds(problem), len(problem.names) + 2
-    points = options.sampled(n)
+    points = options.sample_count(n)
     if given is None:
         X = design("sobol", *bounds, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]

@@ -13,7 +13,7 @@ from ccd_casadi.inner_problem.objective import (
     constraint_sizes,
     hardware_at,
     objective_terms,
-    violated,
+    violations,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.optim.kkt import (
@@ -48,7 +48,7 @@ class LiftedKktOptions:
 class PeakConstraint:
     """A local peak of S as a constraint: its name, ln of it minus ln of its bound, unit-box slope.
 
-    `omega` in rad/s and `member` of the robust set tell which peak it is.
+    `omega` in rad/s and `member` of the robust set identify the peak.
     """
 
     name: str
@@ -59,7 +59,7 @@ class PeakConstraint:
 
     @property
     def tag(self) -> tuple[str, float, int]:
-        """What it is, ln ω and its plant: by these it is found again at another x."""
+        """The kind of the peak, ln ω and its plant: by these it is found again at another x."""
         kind = "peak" if self.name.startswith(OTHER_PEAK) else "shelf"
         return kind, float(np.log(self.omega)), self.member
 
@@ -132,37 +132,38 @@ class TrueDesign:
 
     @property
     def theta(self) -> Array:
-        """θ of x."""
+        """The θ of x."""
         return self.x[: len(self.problem.names)]
 
     @property
     def acceptable(self) -> bool:
         """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
         met = self.problem.inner.feasible(self.design.figures)
-        return met and not violated(self.problem, self.theta)
+        return met and not violations(self.problem, self.theta)
 
     @cached_property
     def terms(self) -> tuple[float, float]:
-        """Those of J."""
+        """The two terms of J."""
         return objective_terms(self.problem, self.theta, self.design.figures.bandwidth)
 
     @property
     def objective(self) -> float:
-        """J."""
+        """The objective J."""
         return sum(self.terms)
 
     @cached_property
     def kkt(self) -> KktCertificate:
-        """Its first-order certificate."""
+        """The first-order certificate of the design."""
         return kkt_certificate(self)
 
     @property
     def residual(self) -> float:
-        """Of the optimality conditions, scaled."""
+        """The scaled residual of the optimality conditions."""
         return max(self.kkt.stationarity, self.kkt.complementarity)
 
     def rise(self, other: "TrueDesign") -> float:
-        """By how much another J is larger, over what J may differ by and still be the same."""
+        """Return by how much another J is larger, over what J may differ by and still be the
+        same."""
         return (other.objective - self.objective) / (
             self.options.accuracy * sum(map(abs, self.terms))
         )
@@ -240,8 +241,8 @@ def lagrangian_hessian(
 
 
 def newton_step(here: TrueDesign) -> Array | None:
-    """Where the step ends; None without a positive reduced Hessian, or where
-    the step is too long.
+    """Return the end of a Newton step; None without a positive reduced Hessian, or where the step
+    is too long.
 
     From a design whose certificate is of the plain conditions. The Hessian takes two true designs
     per free direction. Nocedal and Wright, Numerical Optimization, 18.1.

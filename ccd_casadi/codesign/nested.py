@@ -21,7 +21,7 @@ from ccd_casadi.codesign.outer_problem import (
     outer_program,
     solve_program,
 )
-from ccd_casadi.inner_problem.objective import objective, violated
+from ccd_casadi.inner_problem.objective import objective, violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.sampling.inner_samples import InnerSample
@@ -59,8 +59,8 @@ class Nested:
     kernel: str = "matern52"
     box_points: int = 32
 
-    def sampled(self, variables: int) -> int:
-        """How many designs the plan has."""
+    def sample_count(self, variables: int) -> int:
+        """Return the number of designs of the plan."""
         return self.points**variables if self.plan == "grid" else self.points
 
 
@@ -79,7 +79,7 @@ class NestedRegionOptions:
 
 @dataclass(frozen=True)
 class NestedState:
-    """What the nested formulation knows before a round.
+    """The state of the nested formulation before a round.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ def solve_nested(
     bounds, n = box(problem), len(problem.names)
     if given is None:
         plan = design(options.plan, *bounds, options.points, seed)
-        thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
+        thetas = _keep_allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
         thetas = np.array([sample.x[:n] for sample in given])
     state = NestedState(tuple(sampler.values(thetas)))
@@ -142,11 +142,11 @@ def solve_nested(
         return FormulationResult(message="no sampled theta is feasible")
 
     def refined(state: NestedState, number: int) -> NestedState:
-        """With true inner problems spread over the region around the best θ."""
+        """Add true inner problems spread over the region around the best θ."""
         region = bounds.around(_best(problem, state.samples).theta, state.radius)
         new = design("lhs", *region, 2 * n + 1, seed + number)
         with sampler.spent.on("rounds"):
-            found = sampler.values(_allowed(problem, new), f"refining round {number + 1}")
+            found = sampler.values(_keep_allowed(problem, new), f"refining round {number + 1}")
         return replace(state, samples=(*state.samples, *found))
 
     for number in range(options.max_refinements + 1):
@@ -240,15 +240,15 @@ def fit_bandwidth(
     )
 
 
-def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
+def _keep_allowed(problem: CoDesignProblem, thetas: Array) -> Array:
     """The points with λ(θ) <= 0; all of them where none has."""
-    keep = [not violated(problem, theta) for theta in thetas]
+    keep = [not violations(problem, theta) for theta in thetas]
     return thetas[keep] if any(keep) else thetas
 
 
 def _best(problem: CoDesignProblem, samples: Sequence[InnerSample]) -> InnerSample:
     feasible = [sample for sample in samples if sample.feasible]
-    inside = [s for s in feasible if not violated(problem, s.theta)]
+    inside = [s for s in feasible if not violations(problem, s.theta)]
     return min(inside or feasible, key=lambda s: objective(problem, s.theta, s.value))
 
 

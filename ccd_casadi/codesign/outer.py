@@ -36,7 +36,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import plural
 from ccd_casadi.support.time_budget import ends_early, time_is_up
 from ccd_casadi.synthesis.weights import Weights
 from surrogates import design
@@ -90,7 +90,7 @@ def is_expensive(problem: CoDesignProblem) -> bool:
 
 
 class OuterSearch(ABC):
-    """How designs of one kind are searched for, on a sampler's store and workers."""
+    """The search for designs of one kind, on a sampler's store and workers."""
 
     kkt_level: float  # scaled KKT residual up to which x counts as stationary
     same_optimum = 1e-2  # of the box: ends of local solves that are closer are one optimum
@@ -114,7 +114,8 @@ class OuterSearch(ABC):
         return not is_expensive(self.problem)
 
     def promising(self, thetas: Array, threshold: float) -> Array:
-        """Those of θ (k, n_θ) at which no cheap bound proves J >= threshold; by default all."""
+        """Keep those of θ (k, n_θ) at which no cheap bound proves J >= threshold; by default
+        all."""
         return thetas
 
     @property
@@ -142,7 +143,7 @@ class OuterSearch(ABC):
             if self.extra_variables:
                 return solve_lifted(self.sampler, formulation, seed=seed, given=given)
             formulation = Nested(**vars(formulation) | {
-                "plan": "sobol", "points": formulation.sampled(len(self.problem.names)),
+                "plan": "sobol", "points": formulation.sample_count(len(self.problem.names)),
             })  # fmt: skip
         return solve_nested(self.sampler, formulation, seed=seed, given=given, gradients=lifted)
 
@@ -164,7 +165,7 @@ class OuterSearch(ABC):
             end = self.local_solve(sample, ends)
             ends += [] if end is None else [end]
         if not ends:
-            words = f"no design meets its constraints from {counted(starts, 'start')}"
+            words = f"no design meets its constraints from {plural(starts, 'start')}"
             return FormulationResult(message=words)
         optima = distinct(
             [(end.objective, end.x) for end in ends], self.bounds, starts, self.same_optimum
@@ -176,7 +177,7 @@ class OuterSearch(ABC):
         """Replace an outcome without x: by a design to continue from, or a message why not."""
 
     @abstractmethod
-    def polished(self, x: Array) -> PolishedDesign:
+    def polish(self, x: Array) -> PolishedDesign:
         """Local solve on the truth from x, then compare with a wider search of the inner problem
         at its θ (`gap`)."""
 
@@ -209,19 +210,19 @@ class OuterSearch(ABC):
 
 
 class OuterJudge(ABC):
-    """How the end of a search is judged."""
+    """The judge of the end of a search."""
 
     @abstractmethod
-    def verified(self, end: PolishedDesign, rounds: int) -> Verified:
+    def verify(self, end: PolishedDesign, rounds: int) -> Verified:
         """Judge the design on the truth, after this number of `rounds` of the whole search."""
 
 
 class OuterDescription(ABC):
-    """What is said of a run and its design."""
+    """The words about a run and its design."""
 
     def failure_reason(self, solution: Solution, share: float | None) -> str:
-        """Why a solution is not verified. `share`: part of the tolerance of a robust set of plants
-        up to which the homotopy found designs."""
+        """Explain why a solution is not verified. `share`: part of the tolerance of a robust set of
+        plants up to which the homotopy found designs."""
         return str(solution.result["reason"])
 
     def point_of(self, theta: Sequence[float], weights: Weights) -> Array:
@@ -240,20 +241,20 @@ class Outer(OuterSearch, OuterJudge, OuterDescription):
     changes.
     """
 
-    def prepared(self, seed: int) -> "Outer":
+    def prepare(self, seed: int) -> "Outer":
         """This, ready for a search: for instance with warm starts for the controller."""
         return self
 
-    def resumed(self, folder: Path, seed: int) -> "Outer":
+    def resume(self, folder: Path, seed: int) -> "Outer":
         """This, with the warm starts and plants of the run in a folder, where a kind has them."""
         return self
 
-    def extended(self, end: PolishedDesign) -> "Outer | None":
+    def add_exceeding_plants(self, end: PolishedDesign) -> "Outer | None":
         """This, with the plants on which an end exceeds a bound, to search again; None where there
         are none."""
         return None
 
-    def refuted(self, verified: Verified) -> "Outer | None":
+    def add_refuting_plants(self, verified: Verified) -> "Outer | None":
         """This, with the plants by which the judge refutes a design, to search again from it; None
         where there are none."""
         return None
@@ -285,7 +286,7 @@ class ThetaOuter(Outer, ABC):
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
 
-    def polished(self, x: Array) -> PolishedDesign:
+    def polish(self, x: Array) -> PolishedDesign:
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, sampler = self.problem, self.sampler
         with sampler.spent.on("polish"):

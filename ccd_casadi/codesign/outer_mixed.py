@@ -12,9 +12,9 @@ import numpy as np
 
 from ccd_casadi.codesign.final_judgement import (
     check_references,
+    judge_survival,
     other_damping,
     second_on_weighted,
-    survived,
 )
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
@@ -47,7 +47,7 @@ class MixedOuterOptions:
 
 
 class MixedOuter(Outer):
-    """See the module."""
+    """The outer problem of mixed sensitivity; see the module."""
 
     options = MixedOuterOptions()
     kkt_level = VerifiedDesign.kkt_level
@@ -58,7 +58,7 @@ class MixedOuter(Outer):
         return lifted_bounds(self.problem)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """The true inner problem at a few θ tells an infeasible case from a formulation that
+        """The true inner problem at a few θ separates an infeasible case from a formulation that
         failed."""
         points = design("sobol", *box(self.problem), 8, seed)
         with self.sampler.spent.on("rescue"):
@@ -71,7 +71,7 @@ class MixedOuter(Outer):
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
-    def polished(self, x: Array) -> PolishedDesign:
+    def polish(self, x: Array) -> PolishedDesign:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         sampler, truth = self.sampler, self.sampler.truth
         lower, upper = self.bounds
@@ -125,7 +125,7 @@ class MixedOuter(Outer):
 
         return failure_words(self.sampler, solution, share)
 
-    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:
+    def verify(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:
         problem, sampler, x = self.problem, self.sampler, end.x
         here = TrueDesign(sampler.truth, x)
         theta = tuple(float(v) for v in self.theta_of(x))
@@ -133,7 +133,7 @@ class MixedOuter(Outer):
         # Never from a store: it cannot know all that the design depends on.
         final = final_design(problem, theta, (figures.omega_S, figures.omega_T))
         loops = loops_of(problem, theta, final.controller)
-        found, robust = survived(problem, loops, final.figures)
+        found, robust = judge_survival(problem, loops, final.figures)
         return VerifiedDesign(
             problem=problem,
             x=x,

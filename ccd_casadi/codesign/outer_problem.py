@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.objective import (
     constraint_shares,
     constraint_sizes,
     objective,
-    violated,
+    violations,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import SweepOptions
@@ -70,7 +70,7 @@ class NonlinearProgram:
 
 @dataclass(frozen=True)
 class OuterOptimum:
-    """Where local solves from this number of `starts` ended."""
+    """The end of local solves from this number of `starts`."""
 
     x: Array
     objective: float
@@ -86,7 +86,7 @@ class OuterSolution:
 
     @property
     def best(self) -> OuterOptimum:
-        """That of the least objective."""
+        """The optimum of the least objective."""
         return self.optima[0]
 
 
@@ -211,7 +211,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         return ""
     lower, upper = box(problem)
     points = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])
-    if not all(violated(problem, point) for point in points):
+    if not all(violations(problem, point) for point in points):
         return ""
     theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
     shares = np.array([constraint_shares(problem, point).max() for point in points])
@@ -227,7 +227,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         best = solve_program(program, np.column_stack([points, shares])).best.x[:-1]
     except OuterFailure:
         best = points[np.argmin(shares)]
-    if not violated(problem, best):
+    if not violations(problem, best):
         return ""
     worst = int(np.argmax(constraint_shares(problem, best)))
     least = constraint_values(plant, best)[worst]
@@ -286,7 +286,7 @@ class FormulationResult:
     """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
 
     `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
-    none for direct; `agreed` tells whether prediction and truth met the tolerance at the end.
+    none for direct; `agreed` is whether prediction and truth met the tolerance at the end.
     `foreseen`: what they predicted of the run's end before they learnt it, SI (None: they did not).
     """
 
@@ -300,7 +300,8 @@ class FormulationResult:
 
 
 def outputs_of(figure: FigureOfMerit) -> dict[str, str]:
-    """What `surrogates` are of, in their order, with units; ln of ratios, and of m/N."""
+    """List the quantities that `surrogates` predict, in their order, with units; ln of ratios, and
+    of m/N."""
     ratios = {"ln_sensitivity_peak": "1", "ln_sensitivity_low": "1"}
     return {figure.key: figure.si_unit, **ratios, "ln_compliance": "ln(m/N)"}
 
@@ -311,8 +312,8 @@ KnownSamples = Sequence[InnerSample | QuantitySample]
 
 @dataclass(frozen=True)
 class RunTerms:
-    """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
-    the clock of `perf_counter`."""
+    """The formulation, relative tolerance and seed of a run; `began` on the clock of
+    `perf_counter`."""
 
     formulation: str
     tolerance: float
@@ -322,7 +323,7 @@ class RunTerms:
 
 @dataclass(frozen=True)
 class GlobalCheck:
-    """What was evaluated: true inner problems at `points` θ, `feasible` of these with a design.
+    """A check over the box: true inner problems at `points` θ, `feasible` of these with a design.
 
     `fresh`: those that were solved for it; the run had solved the rest on its way.
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local
@@ -346,7 +347,7 @@ class GlobalCheck:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json."""
+        """The entry of result.json."""
         return {key: value for key, value in vars(self).items() if key != "x"} | {
             "moved": self.moved
         }

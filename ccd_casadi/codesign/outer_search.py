@@ -14,14 +14,14 @@ from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck, Ru
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.result_entries import start_entry
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.objective import objective_of, violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import NoDesign
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage, time_is_up
 from surrogates import design
-from surrogates.fitting import recalibrated
+from surrogates.fitting import recalibrate
 
 
 @dataclass(frozen=True)
@@ -112,11 +112,11 @@ def _ends(problem: CoDesignProblem, theta: Array, same: float) -> Array:
         for end in (lower[i], upper[i])
         if abs(end - theta[i]) > same * (upper[i] - lower[i])
     ]
-    allowed = [x for x in found if not violated(problem, x)]
+    allowed = [x for x in found if not violations(problem, x)]
     return np.array(allowed).reshape(-1, len(theta))
 
 
-def perturbed(
+def solve_perturbed(
     outer: OuterSearch, x: Array, seed: int, options: GlobalCheckOptions = GlobalCheckOptions()
 ) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
@@ -150,7 +150,7 @@ def _spread(
         solved = np.reshape([one.theta for one in known], (-1, n))
         away = bounds.away(spread[:, None], solved)
         spread = spread[(away > 0.5 * points ** (-1.0 / n)).all(axis=1)]
-    free = [theta for theta in spread if not violated(outer.problem, theta)]
+    free = [theta for theta in spread if not violations(outer.problem, theta)]
     more: list[InnerSample] = []
     if free:
         found = sampler.values(np.array(free), "global check")
@@ -181,7 +181,7 @@ def _starts(
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search ends with: `end` None where no design was found; `outer` as it is by then."""
+    """The end of a search: `end` None where no design was found; `outer` as it is by then."""
 
     outer: Outer
     outcome: FormulationResult
@@ -200,7 +200,7 @@ def search_outer(
     `known`: x of a local optimum that another search has found, in place of the formulation;
     `ending`: share of the budget until which ends are polished.
     """
-    outer = outer.prepared(seed)
+    outer = outer.prepare(seed)
     end: PolishedDesign | None = None
     global_check: GlobalCheck | None = None
     for rounds in count(1):
@@ -215,20 +215,20 @@ def search_outer(
             return SearchResult(outer, outcome, None, rounds)
         with stage(ending):
             try:
-                end = outer.polished(outcome.x)
+                end = outer.polish(outcome.x)
             except NoDesign as error:
                 if end is None:
                     return SearchResult(outer, FormulationResult(message=str(error)), None, rounds)
                 break
             # of a design that exceeds a bound on a plant nothing is gained, whatever the time
             last = rounds >= (2 * most if time_is_up() else most)
-            more = None if last else outer.extended(end)
+            more = None if last else outer.add_exceeding_plants(end)
         if more is None:
             outcome, found, global_check = _after_global_check(
                 outer, outcome, end, formulation, seed
             )
             moved = found is not end and rounds < most
-            more, end = outer.extended(found) if moved else None, found
+            more, end = outer.add_exceeding_plants(found) if moved else None, found
         if more is None:
             break
         goes_on = known is not None or isinstance(formulation, Direct) or time_is_up()
@@ -238,7 +238,7 @@ def search_outer(
 
 def _at_hand(outer: OuterSearch, end: PolishedDesign | None) -> Array | None:
     """x where the time is up and a formulation has none: of an end before, else the start."""
-    if end is not None or violated(outer.problem, outer.problem.start):
+    if end is not None or violations(outer.problem, outer.problem.start):
         return None if end is None else end.x
     with stage(StageOptions.ending):
         sample = outer.sampler.values(np.array(outer.problem.start), "at the start")[0]
@@ -257,17 +257,17 @@ def _after_global_check(
         checked = global_check(outer, end, formulation.box_points, seed)
     if checked.x is not None:
         with stage(StageOptions.ending), suppress(NoDesign):
-            found = outer.polished(checked.x)
+            found = outer.polish(checked.x)
             end = best_end([end, found], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity
     retried = outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level
     if retried and not ends_early("perturbed start", GlobalCheckOptions.perturbed_starts):
         with outer.sampler.spent.on("polish"):
-            starts = perturbed(outer, end.x, seed)
+            starts = solve_perturbed(outer, end.x, seed)
         ends = [end]
         for x in starts:
             with suppress(NoDesign):
-                ends.append(outer.polished(x))
+                ends.append(outer.polish(x))
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible:
@@ -298,8 +298,8 @@ def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     if search.end is None:
         return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
     with spent.on("checks"), stage(StageOptions.ending):
-        verified = search.outer.verified(search.end, search.rounds)
-    surrogates = tuple(recalibrated(process, terms.seed) for process in outcome.surrogates)
+        verified = search.outer.verify(search.end, search.rounds)
+    surrogates = tuple(recalibrate(process, terms.seed) for process in outcome.surrogates)
     outcome = replace(outcome, surrogates=surrogates)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.global_check)
@@ -309,5 +309,5 @@ def conclude(search: SearchResult, terms: RunTerms) -> Solution:
 
 def conclude_at(outer: Outer, outcome: FormulationResult, terms: RunTerms) -> Solution:
     """An outcome polished and judged as it is, without a global check over the box."""
-    end = None if outcome.x is None else outer.polished(outcome.x)
+    end = None if outcome.x is None else outer.polish(outcome.x)
     return conclude(SearchResult(outer, outcome, end), terms)

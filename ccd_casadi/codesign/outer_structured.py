@@ -19,9 +19,9 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.final_judgement import (
     between_on_set,
+    judge_survival,
     other_damping,
     second_on_set,
-    survived,
 )
 from ccd_casadi.codesign.outer import Place, PolishedDesign, ThetaOuter, is_expensive, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
@@ -41,12 +41,12 @@ from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
-from ccd_casadi.inner_problem.objective import objective, objective_of, violated
+from ccd_casadi.inner_problem.objective import objective, objective_of, violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.searched_problem import Scenario, state_of, with_warm_start
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertified
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox, recertify
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
@@ -78,9 +78,9 @@ class StructuredOuterOptions:
 
 @dataclass(frozen=True)
 class PolishedStructured(PolishedDesign):
-    """With the sampler of the problem that has it, its value and that one's design and gradients,
-    a multi-start search there (None where plants are to be added first), the worst plant, and those
-    to add."""
+    """The end of a polish of fixed structure: the sampler whose problem has it, its value with
+    design and gradients, a multi-start search there (None where plants are to be added first), the
+    worst plant, and those to add."""
 
     sampler: Sampler
     best: InnerSample
@@ -109,12 +109,13 @@ class StructuredOuter(ThetaOuter):
         return not is_expensive(self.problem)
 
     def promising(self, thetas: Array, threshold: float) -> Array:
-        """By what no controller of any order reaches: far sooner than a search finds none."""
+        """Keep the θ that the bound of every controller does not exclude: far sooner than a search
+        finds none."""
         tasks = {i: (self.problem, theta, threshold) for i, theta in enumerate(thetas.tolist())}
-        excluded = dict(results(self.sampler.workers, _excluded, tasks))
+        excluded = dict(results(self.sampler.workers, _is_excluded, tasks))
         return thetas[[not excluded[i] for i in tasks]]
 
-    def prepared(self, seed: int) -> "StructuredOuter":
+    def prepare(self, seed: int) -> "StructuredOuter":
         """Searched at the start for warm starts and the plant set, where there are none."""
         sampler = self.sampler
         if state_of(sampler.problem).warm_starts:
@@ -125,15 +126,15 @@ class StructuredOuter(ThetaOuter):
         lost = words and not state_of(problem).warm_starts
         return StructuredOuter(sampler.of(problem), words if lost else "")
 
-    def resumed(self, folder: Path, seed: int) -> "StructuredOuter":
-        """With the warm starts, plants and controller of a run; those of a search where it has
+    def resume(self, folder: Path, seed: int) -> "StructuredOuter":
+        """Take up the warm starts, plants and controller of a run; those of a search where it has
         none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
-            return self.prepared(seed)
+            return self.prepare(seed)
         result = read_json(path)
         problem = with_function(path, sampler.problem, result)
-        outer = StructuredOuter(sampler.of(problem)).prepared(seed)
+        outer = StructuredOuter(sampler.of(problem)).prepare(seed)
         if (folder / "controller.json").exists():
             theta = [float(result["theta"][name]) for name in problem.names]
             outer.sampler.value_from(theta, sections_kappa(folder, structure_of(problem)))
@@ -142,12 +143,13 @@ class StructuredOuter(ThetaOuter):
     def local_solve(
         self, sample: InnerSample, earlier: Sequence[Place], settled: float | None = None
     ) -> Place | None:
-        """By the joint search where J counts the bandwidth, on the worse plants of its way."""
+        """Solve by the joint search where J counts the bandwidth, on the worse plants of its
+        way."""
         if self.problem.figure is not BANDWIDTH or settled is not None:
             return super().local_solve(sample, earlier, settled)
-        tell = printer("local solve", self.sampler.quiet)
+        log = printer("local solve", self.sampler.quiet)
         ends = [(place.x, place.objective) for place in earlier]
-        sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), tell, ends)
+        sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), log, ends)
         J = objective_of(sampler.problem, best)
         if not np.isfinite(J):
             return None
@@ -155,7 +157,7 @@ class StructuredOuter(ThetaOuter):
             self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
         return Place(np.array(best.theta), J, ended)
 
-    def polished(self, x: Array) -> PolishedStructured:
+    def polish(self, x: Array) -> PolishedStructured:
         sampler, theta, options = self.sampler, self.theta_of(x), self.structured_options
         enough = NeighbourOptions().least_gain if self.retries_pay else options.better_at_elements
         for attempt in range(options.polishes):
@@ -184,8 +186,8 @@ class StructuredOuter(ThetaOuter):
             multistart, worst, scenarios,
         )  # fmt: skip
 
-    def extended(self, end: PolishedDesign) -> "StructuredOuter | None":
-        """With plants that it does not keep, searched for this alone: fresh ones judge the
+    def add_exceeding_plants(self, end: PolishedDesign) -> "StructuredOuter | None":
+        """Add the plants that the end does not keep, searched for this alone: fresh ones judge the
         answer."""
         end = cast(PolishedStructured, end)
         if not end.scenarios:
@@ -194,7 +196,7 @@ class StructuredOuter(ThetaOuter):
         sampler = with_scenarios(end.sampler.of(anchored), end.scenarios)
         return StructuredOuter(sampler, ended=True, repairs=self.repairs)
 
-    def refuted(self, verified: Verified) -> "StructuredOuter | None":
+    def add_refuting_plants(self, verified: Verified) -> "StructuredOuter | None":
         verified = cast(VerifiedStructured, verified)
         if not verified.counterexamples:
             return None
@@ -202,11 +204,11 @@ class StructuredOuter(ThetaOuter):
         sampler = with_scenarios(self.sampler.of(anchored), verified.counterexamples)
         return StructuredOuter(sampler, ended=True, repairs=self.repairs + 1)
 
-    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedStructured:
+    def verify(self, end: PolishedDesign, rounds: int) -> VerifiedStructured:
         end = cast(PolishedStructured, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
-        design = recertified(problem, best.theta, design)  # what a store holds is not relied on
+        design = recertify(problem, best.theta, design)  # what a store holds is not relied on
         judging = BoxCheckOptions()
         judging = replace(judging, turn=self.repairs)
         on_box = DesignOnBox(problem, best.theta, design, judging)
@@ -221,7 +223,7 @@ class StructuredOuter(ThetaOuter):
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
         def judged() -> "tuple[SetCertificate, int, Proof, Yield | None, tuple[Scenario, ...]]":
-            whole = on_box.judged(worst, sampler.workers)
+            whole = on_box.judge(worst, sampler.workers)
             if whole[-1].conclusive:
                 return *whole, None, ()
             return *whole, *on_box.fresh_yield(sampler.workers)
@@ -234,7 +236,7 @@ class StructuredOuter(ThetaOuter):
             known_gap = extensions.function("known_gap")
             gap = None if known_gap is None else known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
-            survival = survived(problem, loops, design)[0]
+            survival = judge_survival(problem, loops, design)[0]
             damping, reported = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 reported = stated_time(problem, best.theta, design.controller, best.value)
@@ -250,7 +252,7 @@ class StructuredOuter(ThetaOuter):
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
             inner_gap=float(np.maximum(_gap(problem, best, multistart), 0.0)),
-            feasible=design.certified and not violated(problem, best.theta),
+            feasible=design.certified and not violations(problem, best.theta),
             survival=survival,
             damping=damping,
             design=design,
@@ -280,9 +282,9 @@ def _worst_plants(
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for a design and those to add, by one search and, where that finds
     none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
-    problem, tell = sampler.problem, printer("at the end", sampler.quiet)
+    problem, log = sampler.problem, printer("at the end", sampler.quiet)
     on_box = DesignOnBox(problem, best.theta, design)
-    worst, scenarios = on_box.worst(0, tell, sampler.workers)
+    worst, scenarios = on_box.worst(0, log, sampler.workers)
     if scenarios or not np.isfinite(objective_of(problem, best)):
         return worst, scenarios
     if ends_early("worst-plant check", options.searches):
@@ -291,11 +293,11 @@ def _worst_plants(
     count = options.searches_at_elements if few else options.searches
     turns = range(options.first_seed, options.first_seed + count)
     workers = Workers(1) if few else sampler.workers  # this process knows the elements
-    other, scenarios = on_box.worst_elsewhere(turns, workers, tell)
+    other, scenarios = on_box.worst_elsewhere(turns, workers, log)
     return max(worst, other, key=lambda one: one.value), scenarios
 
 
-def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) -> bool:
+def _is_excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) -> bool:
     """Whether it is shown that J is at least that at θ."""
     if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
         return False
@@ -318,8 +320,9 @@ def polish_structured(
     ended: bool = False,
     options: StructuredOuterOptions = StructuredOuterOptions(),
 ) -> tuple[Sampler, InnerSample]:
-    """From a design nearly optimal to the best θ that is found near it on the true problem, and
-    the sampler of the problem that has it: with more plants, where worse ones were found.
+    """Polish a nearly optimal design to the best θ that is found near it on the true problem;
+    return it with the sampler of the problem that has it: with more plants, where worse ones were
+    found.
 
     By the joint search where J counts the bandwidth, which tries no places far from where one has
     `ended`; from there, where J is not stationary, by pieces (`pieces`), which know kinks, unless
@@ -327,8 +330,8 @@ def polish_structured(
     """
     problem = sampler.problem
     if problem.figure is BANDWIDTH:
-        tell = printer("on the way", sampler.quiet)
-        sampler, best, _ = joint_search(sampler, theta, tell, polls=not ended)
+        log = printer("on the way", sampler.quiet)
+        sampler, best, _ = joint_search(sampler, theta, log, polls=not ended)
         problem = sampler.problem
         if best.feasible and is_expensive(problem):
             return sampler, best

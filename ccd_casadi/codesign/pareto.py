@@ -11,7 +11,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.outer import OuterSearch
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.structured_entries import bound_words
-from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.objective import objective_of, violations
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
@@ -109,7 +109,7 @@ def pareto_front(
     f_range = np.ptp(costs)
     if not f_range > options.constant * np.abs(costs).max():
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
-    allowed = [i for i in np.argsort(costs) if not violated(problem, examined[i])]
+    allowed = [i for i in np.argsort(costs) if not violations(problem, examined[i])]
     started = sampler.values(examined[[0, allowed[0], allowed[-1]]], "starts of the front")
     if not started[0].feasible:
         raise UserError(f"the run's design is not certified: {started[0].shortfall}")
@@ -154,7 +154,8 @@ def pareto_front(
 
 
 def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
-    """How far a point lies beyond the line from `light` that has this slope, as a share of both."""
+    """Return how far a point lies beyond the line from `light` that has this slope, as a share of
+    both."""
     lighter = (light.hardware_cost - new.hardware_cost) / b
     return lighter + (new.worth - light.worth) / a
 
@@ -172,7 +173,7 @@ def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bo
 
 
 def hull(points: Sequence[FrontPoint], same: float = FrontOptions().same) -> list[FrontPoint]:
-    """In order of cost, the points that are the best of all for some weights."""
+    """Select the points that are the best of all for some weights, in order of cost."""
     kept: list[FrontPoint] = []
     for point in sorted(points, key=lambda point: (point.hardware_cost, -point.worth)):
         if not np.isfinite(point.worth):

@@ -66,7 +66,7 @@ class OptimumResponse:
 
 @dataclass(frozen=True)
 class PostOptimal:
-    """How an optimum responds to the parameters of its case.
+    """The response of an optimum to the parameters of its case.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ def structured_responses(
 
 
 def _strong(kkt: KktCertificate, weak: float = 1e-6) -> list[str]:
-    """What holds the design: a multiplier above this share of ‖∇J‖∞."""
+    """Name what holds the design: a multiplier above this share of ‖∇J‖∞."""
     size = float(np.abs(kkt.objective_gradient).max())
     return [name for name in kkt.active if kkt.multipliers[name] > weak * size]
 

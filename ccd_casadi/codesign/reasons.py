@@ -13,10 +13,10 @@ from typing import Any, Self
 
 from ccd_casadi.inner_problem.controller_problem import FIGURES
 from ccd_casadi.support.text import (
-    counted,
     distinct_texts,
     inwards,
     number,
+    plural,
     small_share,
     spoken,
     with_unit,
@@ -27,7 +27,7 @@ LOOP = "bandwidth {bandwidth_hz:.4g} Hz, peak of S {sensitivity_peak:.5g}"
 
 
 class Reason(Enum):
-    """Why a line of the verdict is as it is; called with figures it makes a `Finding`.
+    """The reason for the state of a line of the verdict; called with figures it makes a `Finding`.
 
     Its sentence has fields: figures of the finding or of its line, in SI and in what their names
     say, and what `DERIVED` makes of these. They are formatted by `FORMATS` or by Python, with
@@ -43,12 +43,12 @@ class Reason(Enum):
         return made
 
     def __call__(self, **figures: Any) -> "Finding":
-        """Make a finding."""
+        """Make a finding of the reason with its figures."""
         return Finding(self, figures)
 
     @property
     def key(self) -> str:
-        """Of result.json."""
+        """The key of result.json."""
         return self.name.lower()
 
     QUOTED = "{words}"
@@ -234,7 +234,7 @@ class Finding:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
     def words(self, line: Mapping[str, Any] | None = None) -> str:
-        """Render the sentence.
+        """Render the sentence with the figures.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ class Finding:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of `findings` in result.json."""
+        """The entry of `findings` in result.json."""
         return {"reason": self.reason.key, **self.figures}
 
 
@@ -287,8 +287,8 @@ def _quantity(value: float, more: str) -> str:
 
 
 FORMATS: dict[str, Callable[[Any, str], str]] = {
-    "count": counted,
-    "counts": lambda counts, _: ", ".join(counted(n, name) for name, n in counts.items()),
+    "count": plural,
+    "counts": lambda counts, _: ", ".join(plural(n, name) for name, n in counts.items()),
     "digits": lambda value, more: number(value, int(more)),
     "distinct": lambda values, _: ", ".join(distinct_texts(values)),
     "hz": lambda values, _: ", ".join(f"{hz:.4g}" for hz in values[:3]),
@@ -319,7 +319,7 @@ def within_words(excess: float, looseness: float) -> str:
 
 def _tried(known: Mapping[str, Any]) -> str:
     starts, optima = known["starts"], known["distinct_optima"]
-    words = f"best of {counted(starts, 'start')}" if starts else "from one start"
+    words = f"best of {plural(starts, 'start')}" if starts else "from one start"
     return f"{words}, {optima} distinct optima" if optima > 1 else words
 
 
@@ -330,7 +330,7 @@ def _checked_at(known: Mapping[str, Any]) -> str:
 
 
 def _sides(known: Mapping[str, Any]) -> str:
-    """What values beside a kink say."""
+    """Describe the values beside a kink."""
     pairs = known["slopes"]
     if not pairs:
         return "was not evaluated beside it: bounds alone hold theta"
@@ -339,13 +339,14 @@ def _sides(known: Mapping[str, Any]) -> str:
     if not count:
         return "is not known beside it"
     where = "both sides" if count == len(found) else f"the {count} known sides of {len(found)}"
-    of = f" of {counted(len(pairs), 'direction')}" if len(pairs) > 1 else ""
+    of = f" of {plural(len(pairs), 'direction')}" if len(pairs) > 1 else ""
     rises = "rises" if known["least_slope"] > 0.0 else "rises or stays"
     return f"{rises} on {where}{of}"
 
 
 def _range(known: Mapping[str, Any], name: str) -> str:
-    """Of resonance shifts in %; one that was not followed further has a "<" or ">"."""
+    """Describe a range of resonance shifts in %; one that was not followed further has a "<" or
+    ">"."""
     ends = [math.nan if end is None else end for end in known[name]]
     most = 0.999 * known["shift_followed_to"]
     beyond = [mark if abs(end) >= most else "" for mark, end in zip("<>", ends, strict=True)]
@@ -365,17 +366,17 @@ PROVEN = {
     "searched": "searched, not proven",
 }
 DERIVED: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "better_shown": lambda known: FIGURES[known["merit"]].shown(known["better"]),
+    "better_shown": lambda known: FIGURES[known["merit"]].format_value(known["better"]),
     "checked_at": _checked_at,
     "evidence_words": lambda known: Reason[known["evidence"].upper()]().words(known),
-    "own_shown": lambda known: FIGURES[known["merit"]].shown(known["own"]),
+    "own_shown": lambda known: FIGURES[known["merit"]].format_value(known["own"]),
     "proof_of_set": lambda known: PROVEN[known["set"]],
     "S_max_range": lambda known: _range(known, "S_max_shift"),
     "sides": _sides,
     "stable_range": lambda known: _range(known, "stable_shift"),
     "tried": _tried,
     "unstable_shifts": _unstable_shifts,
-    "value_shown": lambda known: FIGURES[known["merit"]].shown(known["value"]),
+    "value_shown": lambda known: FIGURES[known["merit"]].format_value(known["value"]),
     "where": lambda known: f" ({known['plant']})" if known["plant"] else "",
     "within": lambda known: within_words(known["worst_excess"], known["looseness"]),
 }

@@ -23,7 +23,7 @@ from ccd_casadi.support.text import HZ
 
 
 class Evidence(StrEnum):
-    """How a figure is known; its value is the word for it.
+    """The way in which a figure is known; its value is the word for it.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Requirement:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Its entry in result.json."""
+        """The entry of result.json."""
         return {**vars(self), "evidence": self.evidence.value}
 
 
@@ -92,8 +92,8 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
         kind_of(verified.problem).bounds(),
         verified.judgement,
     )
-    required, worst = _required(bounds), verified.largest_at(bounds, peak_hz)
-    proven = verified.proven()
+    required, worst = _required_bounds(bounds), verified.largest_at(bounds, peak_hz)
+    proven = verified.proven_figures()
     evidence = Evidence.SEARCHED if judged.plants > 1 else Evidence.JUDGED
     found = []
     of_set = verified.robust if isinstance(verified, VerifiedDesign) else None
@@ -126,7 +126,7 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
     return tuple(found)
 
 
-def _required(bounds: Bounds) -> dict[str, float]:
+def _required_bounds(bounds: Bounds) -> dict[str, float]:
     """The bounds by the names that the judge has, in the units of their keys."""
     level, compliance = bounds.weighted_level, bounds.compliance_max
     known = {

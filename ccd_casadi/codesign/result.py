@@ -26,7 +26,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.requirements import requirements
 from ccd_casadi.codesign.result_entries import budget_entry, iso_entry, move_entry
-from ccd_casadi.codesign.verdict import Check, State, confirmed, deployable, optimal, predicted
+from ccd_casadi.codesign.verdict import Check, State, confirm, deployable, judge_prediction, optimal
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import notes_of
 from ccd_casadi.sampling.inner_samples import spent_entry
@@ -61,13 +61,13 @@ def result_dict(
     optimality = partial(
         optimal, verified.kkt, level=verified.kkt_level, saddle=verified.saddle,
         tolerance=tolerance, better=verified.better(), unknown=verified.no_gradient(),
-        searched=verified.searched(outcome, global_check),
+        searched=verified.search_findings(outcome, global_check),
     )  # fmt: skip
     judged = quality[0] if quality else None
     verdict = (  # in the order in which they matter
-        confirmed(verified.certified_line(), verified.second),
+        confirm(verified.certified_line(), verified.second),
         optimality(gap=verified.inner_gap),
-        predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
+        judge_prediction(error, tolerance, verified.value, problem.figure, judged, learnt),
         verified.survives_line(),
         deployable(verified.survival, problem.sampling, verified.between, problem.inner.S_max),
     )
@@ -170,7 +170,7 @@ def of_budget(
 
 
 def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:
-    """What the last surrogate says at a design x of its value, SI.
+    """Predict the value of a design x by the last surrogate, SI.
 
     Without a surrogate it is `value`, that of the design.
     """
@@ -187,7 +187,7 @@ def infeasible_dict(terms: RunTerms, reason: str, spent: Mapping[str, int]) -> d
 
 
 def run_entry(terms: RunTerms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
-    """What every result.json says of its run."""
+    """Write what every result.json has of its run."""
     return {
         "format": FORMAT,
         **spent_entry(spent, moved),
@@ -251,7 +251,7 @@ def with_verdict_line(run: "FinishedRun", out: Path, line: Check) -> "FinishedRu
     return replace(run, result=result)
 
 
-def resolved(case: Case, solution: Solution) -> Case:
+def resolve(case: Case, solution: Solution) -> Case:
     """Fix what a case left open at what was found best: design plant, listed values.
 
     Parameters
@@ -309,7 +309,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)
-    write_case(folder, resolved(case, solution))
+    write_case(folder, resolve(case, solution))
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

@@ -53,7 +53,8 @@ def figures_dict(figures: DesignFigures) -> dict[str, Any]:
 
 
 def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> dict[str, Any]:
-    """What a force moves, m/N: ‖GS‖∞, at rest (0: an integrator) and at ω_low; and in words."""
+    """Write what a force moves, m/N: ‖GS‖∞, at rest (0: an integrator) and at ω_low; and in
+    words."""
     return {
         "compliance_max": most,
         "static_compliance": at_rest,

@@ -61,7 +61,7 @@ def stored_designs(
             or len(row.theta) != len(problem.names)
             or len(row.gradients or ()) != (2 + len(problem.inner.bounds)) * len(bounds.lower)
         ):
-            raise store.damaged()
+            raise store.damaged_error()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
         inside = np.clip(x, *bounds)
         if bounds.away(x, inside) <= rounding:
@@ -74,7 +74,7 @@ def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
     lower, upper = box(problem)
     thetas = store.thetas(hashes_of(problem)[1])
     if any(len(theta) != len(lower) for theta in thetas):
-        raise store.damaged()
+        raise store.damaged_error()
     X = np.array(thetas, dtype=float).reshape(-1, len(lower))
     return X[((lower <= X) & (upper >= X)).all(axis=1)]
 
@@ -173,7 +173,7 @@ class RetrainingOptions:
 
 @dataclass(frozen=True)
 class RetrainingEnd:
-    """How a job ended; spent: syntheses since the first job on this run folder began."""
+    """The end of a job; spent: syntheses since the first job on this run folder began."""
 
     status: str
     reason: str
@@ -224,7 +224,7 @@ class Job:
 
     @property
     def left(self) -> int:
-        """Of the budget."""
+        """The rest of the budget."""
         return self.budget - (self.spent - self.base)
 
     @property
@@ -233,7 +233,7 @@ class Job:
         return self.formulation == "nested" or not self.outer.extra_variables
 
     def run(self, write: Callable[[Solution], object]) -> RetrainingEnd:
-        """To its end; `write` puts a solution into the folder.
+        """Run the job to its end; `write` puts a solution into the folder.
 
         Raises UserError where the budget is too small for a first fit.
         """
@@ -249,11 +249,11 @@ class Job:
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
         outcome = FormulationResult(message=words)
         if not words:
-            outcome = self._trained(terms.tolerance)
+            outcome = self._train(terms.tolerance)
             if outcome.x is None:
                 outcome = outer.fallback(outcome, self.seed)
         solution = conclude_at(outer, outcome, terms)
-        version = self._kept(outcome)
+        version = self._keep_surrogate(outcome)
         reason = "converged" if outcome.agreed else "budget" if self.left <= 0 else "rounds"
         retraining = mark | {"version": version, "samples": self.spent, "reason": reason}
         solution.result.update(spent_entry({"store": self.spent}), retraining=retraining)
@@ -262,7 +262,7 @@ class Job:
         return RetrainingEnd(status, reason, rounds, self.spent - self.base, version)
 
     def _ended_before(self, mark: dict[str, Any]) -> RetrainingEnd | None:
-        """What an earlier job ended with, where there is nothing left to do."""
+        """Return the end of an earlier job, where there is nothing left to do."""
         path = self.folder / "result.json"
         if not path.exists() or not (self.folder / "report.html").exists():
             return None
@@ -276,10 +276,10 @@ class Job:
         return RetrainingEnd(str(found.get("status")), NOTHING_NEW, 0, self.spent - self.base,
                        before.get("version"))  # fmt: skip
 
-    def _trained(self, tolerance: float) -> FormulationResult:
+    def _train(self, tolerance: float) -> FormulationResult:
         """Rounds of the formulation from what is known, as many as the budget allows."""
         name = "nested" if self.formulation == "nested" else "lifted"  # direct has no surrogates
-        given = self._known()
+        given = self._read_known()
         if given is None:
             words = "too few points where the truth has a value"
             return FormulationResult(message=words)
@@ -294,14 +294,15 @@ class Job:
         """Syntheses a sample, as far as is known of whole inner problems."""
         return max(self.spent, 1) / max(samples, 1) if self.over_theta else 1.0
 
-    def _known(self) -> KnownSamples | None:
-        """What the store holds within the bounds, a first design added where that is too little.
+    def _read_known(self) -> KnownSamples | None:
+        """Read what the store holds within the bounds, and add a first design where that is too
+        little.
 
         None where the truth has no value at most of its points. Raises UserError where the budget
         is too small for it.
         """
         bounds = box(self.outer.problem) if self.over_theta else self.outer.bounds
-        n, seen = len(bounds.lower), self._stored()
+        n, seen = len(bounds.lower), self._read_stored()
         least, same = self.options.samples_per_input * n, self.options.same
         for doubling in range(self.options.doublings):
             if len(_usable(seen)) >= least:
@@ -321,7 +322,7 @@ class Job:
             raise UserError(f"--budget {self.budget} {words}")
         return kept
 
-    def _stored(self) -> "list[Seen]":
+    def _read_stored(self) -> "list[Seen]":
         """Samples of the store within the bounds, oldest first, failures among them."""
         store, problem = self.outer.sampler.store, self.outer.problem
         if self.over_theta:
@@ -330,11 +331,11 @@ class Job:
         return [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
 
     def _truth(self, X: Array) -> "list[Seen]":
-        """At X (m, d), what is known already from the store."""
+        """Evaluate X (m, d), with what is known already from the store."""
         sampler = self.outer.sampler
         return [*(sampler.values if self.over_theta else sampler.quantities)(X, "retraining")]
 
-    def _kept(self, outcome: FormulationResult) -> str | None:
+    def _keep_surrogate(self, outcome: FormulationResult) -> str | None:
         """The name of the version that the job's surrogate is kept as."""
         if not outcome.surrogates:
             return None
@@ -359,11 +360,12 @@ Seen = InnerSample | QuantitySample
 
 
 def _usable(samples: list[Seen]) -> list[Seen]:
-    """Those with a value."""
+    """Select the samples with a value."""
     return [s for s in samples if (s.feasible if isinstance(s, InnerSample) else s.certified)]
 
 
 def _distances(X: Array, others: list[Seen], bounds: Box) -> Array:
-    """Of X (m, d) to the nearest of the samples, the largest component in shares of the box."""
+    """Return the distance of X (m, d) from the nearest of the samples: the largest component in
+    shares of the box."""
     known = np.reshape([sample.x for sample in others], (-1, X.shape[1]))
     return np.asarray(bounds.away(X[:, None], known).min(axis=1, initial=np.inf))

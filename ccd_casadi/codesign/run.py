@@ -184,7 +184,7 @@ def co_design(
         for _ in range(RepairOptions.most):
             if found.end is None or solution.verified is None:
                 break
-            more = found.outer.refuted(solution.verified)
+            more = found.outer.add_refuting_plants(solution.verified)
             if more is None:
                 break
             with stage(StageOptions.repair):
@@ -255,9 +255,9 @@ def verify(sampler: Sampler, x: Array) -> Verified:
         The design with its certificates.
     """
     outer = outer_of(sampler)
-    end = outer.polished(x)
+    end = outer.polish(x)
     with sampler.spent.on("checks"):
-        return outer.verified(end, 1)
+        return outer.verify(end, 1)
 
 
 def require_solvable(problem: CoDesignProblem) -> None:

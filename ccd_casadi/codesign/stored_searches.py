@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.structured_bandwidth import (
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
-    prepared,
+    prepare_search,
     search_starts,
     with_range,
 )
@@ -31,7 +31,7 @@ from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.sampling.units import problem_hash, sample_key
-from ccd_casadi.support.terminal import Tell, remark
+from ccd_casadi.support.terminal import Log, remark
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def searched() -> InitialSearch:
-        tell = printer("search at the start", sampler.quiet)
-        anchored, made, _ = prepared(problem, tell, sampler.workers)
-        anchored, made, _ = least_from(anchored, problem.start, made, tell, sampler.workers)
+        log = printer("search at the start", sampler.quiet)
+        anchored, made, _ = prepare_search(problem, log, sampler.workers)
+        anchored, made, _ = least_from(anchored, problem.start, made, log, sampler.workers)
         own, start = state_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
@@ -128,6 +128,6 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
     return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
 
 
-def printer(label: str, quiet: bool) -> Tell:
+def printer(label: str, quiet: bool) -> Log:
     """Lines of progress on stderr."""
     return lambda words: remark(f"{label}: {words}", quiet)

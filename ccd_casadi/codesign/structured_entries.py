@@ -25,7 +25,7 @@ from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.text import HZ, plural
 
 if TYPE_CHECKING:
     from ccd_casadi.fixed_structure.box_proof import Proof
@@ -173,7 +173,7 @@ def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, A
     return {
         "plants": plants,
         "passed": wide.passed,
-        "words": f"stable, {within} on {counted(plants, 'plant')}" if wide.passed else wide.words,
+        "words": f"stable, {within} on {plural(plants, 'plant')}" if wide.passed else wide.words,
         "bandwidth_hz": wide.bandwidth / HZ,
         "worst_excess": excess,
     }

@@ -34,7 +34,7 @@ from ccd_casadi.inner_problem.objective import (
     ConstraintOptions,
     constraint_shares,
     objective_of,
-    violated,
+    violations,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.searched_problem import (
@@ -86,7 +86,7 @@ class ListedStructured:
     options: ListedOptions = ListedOptions()
 
     def between(self, sampler: Sampler, near: Solution | None) -> Solution:
-        """As `search`, to the accuracy that a bound needs."""
+        """Search as `search` does, to the accuracy that a bound needs."""
         return self.search(sampler, near, self.options.settled)
 
     def search(
@@ -106,34 +106,35 @@ class ListedStructured:
             self.scenarios = tuple(dict.fromkeys(chain(*each)))
 
     def _anew(self, sampler: Sampler, settled: float | None) -> Solution:
-        outer = StructuredOuter(sampler).prepared(self.seed)
-        found = _climbed(outer.sampler, np.array(sampler.problem.start), settled)
+        outer = StructuredOuter(sampler).prepare(self.seed)
+        found = _descend(outer.sampler, np.array(sampler.problem.start), settled)
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
-            allowed = _allowed(sampler.problem, theta)
+            allowed = _nearest_allowed(sampler.problem, theta)
             if not np.isfinite(found.result.get("objective", np.inf)) and allowed is not None:
-                found = _climbed(outer.sampler, allowed, settled)
+                found = _descend(outer.sampler, allowed, settled)
         return found
 
     def _near(self, sampler: Sampler, near: Solution, settled: float | None) -> Solution:
         problem, known = sampler.problem, _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
-        theta = _allowed(problem, np.array([values[name] for name in problem.names]))
+        theta = _nearest_allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta within the constraints was found")
-        return _climbed(sampler.of(carried(known, problem, self.scenarios)), theta, settled)
+        return _descend(sampler.of(carry_over(known, problem, self.scenarios)), theta, settled)
 
     def judge(self, sampler: Sampler, solution: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
         near = _start(solution)
-        started = carried(near, replace(sampler.problem, start=near.start), self.scenarios)
+        started = carry_over(near, replace(sampler.problem, start=near.start), self.scenarios)
         whole = self.solve(sampler.of(started), np.array(near.start))
         if whole.verified is not None:
             self.scenarios = state_of(whole.verified.problem).scenarios
         return whole
 
 
-def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> Solution:
-    """From θ to the least J near by; by steps along the truth where the joint search breaks λ.
+def _descend(sampler: Sampler, theta: Array, settled: float | None = None) -> Solution:
+    """Descend from θ to the least J near by; by steps along the truth where the joint search breaks
+    λ.
 
     `settled`: of the terms of J, as in `ListedOptions`; None: as near as any joint search."""
     best = first = sampler.values(theta, "nearby designs")[0]
@@ -144,9 +145,9 @@ def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> So
         share = settled * (abs(hardware) + abs(J - hardware)) / abs(J)
         options = replace(options, model=replace(options.model, settled=share))
     if sampler.problem.figure is BANDWIDTH:
-        tell = printer("nearby designs", sampler.quiet)
-        required, best, _ = joint_search(sampler, theta, tell, ends=(), options=options)
-    if best.theta == first.theta or violated(required.problem, best.theta):  # it lost λ
+        log = printer("nearby designs", sampler.quiet)
+        required, best, _ = joint_search(sampler, theta, log, ends=(), options=options)
+    if best.theta == first.theta or violations(required.problem, best.theta):  # it lost λ
         descent = ThetaDescentOptions()
         best = pieces_from(sampler, first, descent.settled, descent.far_radius)
         required = sampler
@@ -166,7 +167,7 @@ def _climbed(sampler: Sampler, theta: Array, settled: float | None = None) -> So
     return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
 
 
-def carried(
+def carry_over(
     near: CoDesignProblem, problem: CoDesignProblem, scenarios: tuple[Scenario, ...]
 ) -> CoDesignProblem:
     """A problem with the warm starts of one like it, moved from that one's start to its own."""
@@ -202,7 +203,7 @@ def _nothing(words: str) -> Solution:
     return Solution(result, FormulationResult(message=words), None)
 
 
-def _allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-7) -> Array | None:
+def _nearest_allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-7) -> Array | None:
     """The nearest θ within the box and λ(θ) <= -`inside`; None where none is found.
 
     A constraint on listed values alone is a number here, which may be 0: as many places are chosen

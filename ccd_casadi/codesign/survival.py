@@ -99,8 +99,8 @@ class LoopsOffModel:
 
     @property
     def other(self) -> "LoopsOffModel":
-        """With damping as it is not taken under a shift: of ratios the matrix is kept, of a
-        matrix the ratios."""
+        """The loops with the other rule of damping under a shift: instead of ratios the matrix is
+        kept, instead of a matrix the ratios."""
         flexible = ~self.plant.rigid
         own = np.where(flexible[:, None] & flexible, self.matrix, 0.0)
         at_ports = self.at_ports and self.at_ports.other
@@ -141,7 +141,7 @@ class LoopsOffModel:
         strength = np.linalg.norm(self.plant.B, axis=1) * np.linalg.norm(self.plant.C, axis=0)
         flexible = np.flatnonzero(~self.plant.rigid & ~self.plant.driven_away)
         natural = np.sqrt(np.maximum(k, 0.0))
-        gain = np.linalg.norm(self.run.swept(natural[flexible]), axis=(1, 2))
+        gain = np.linalg.norm(self.run.sweep(natural[flexible]), axis=(1, 2))
         gain *= strength[flexible] / np.maximum((natural * d)[flexible], 1e-300)
         modes = flexible[gain > self.options.weak_gain]
         zeros = self.run.zeros(float(np.abs(self.run.poles).max(initial=0.0)))
@@ -152,8 +152,8 @@ class LoopsOffModel:
         return at.ravel(), width.ravel()
 
     def step(self, shift: float) -> float:
-        """How far the next shift may be: a share of the distance to the nearest meeting in the
-        complex plane."""
+        """Return how far the next shift may be: a share of the distance to the nearest meeting in
+        the complex plane."""
         at, width = self._meetings
         near = float(np.hypot(at - shift, width).min(initial=np.inf))
         return min(self.options.largest_step, self.options.meeting_step * max(near, 1e-4))
@@ -206,7 +206,7 @@ Function = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Survival:
-    """What a loop survives off its model, and its margins.
+    """The changes of a plant that a loop survives, and its margins.
 
     A range that ends at `reach` or `factors` of the options was not followed further. Margins are
     the least of all loops broken one at a time at the plant's inputs.
@@ -301,7 +301,7 @@ def growth_of(loop: Loop) -> float:
 
 
 def excess_of(loop: Loop, level: float) -> float:
-    """By how much a loop exceeds a level of S: ln(‖S‖∞ / level).
+    """Return how far a loop exceeds a level of S: ln(‖S‖∞ / level).
 
     Parameters
     ----------
@@ -507,8 +507,8 @@ def reach(
 def highest(
     f: Function, places: Sequence[float], values: Sequence[float], least: float = 1e-9
 ) -> float | None:
-    """Where the local maximum is that three neighbours bracket, to `least`; None where it stays
-    below zero.
+    """Return the local maximum that three neighbours bracket, to `least`; None where it stays below
+    zero.
 
     A parabola rises above its middle place by less than by what that is above the lower of the
     others.

@@ -21,7 +21,7 @@ from ccd_casadi.codesign.joint_model import (
     JointModelOptions,
     JointPoint,
     Proposal,
-    proposed,
+    propose_step,
 )
 from ccd_casadi.codesign.working_set import WorkingSet
 from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
@@ -84,7 +84,7 @@ class Around:
 
     @staticmethod
     def of(problem: CoDesignProblem, place: JointPoint) -> "Around":
-        """Those around a place."""
+        """Make the models around a place."""
         bases = (place.theta,) if _has_basis(problem) else ()
         return Around(nearby(problem, bases, place.theta), place.theta)
 
@@ -96,7 +96,7 @@ class Around:
 
 @dataclass(frozen=True)
 class JointState:
-    """What a joint search knows before a round.
+    """The state of a joint search before a round.
 
     Attributes
     ----------
@@ -138,18 +138,18 @@ class JointState:
         options: JointSearchOptions,
         count: int = WorstPlantOptions.lattice,
     ) -> "JointState":
-        """With the plants that searches find worse, and the controller adapted to these."""
+        """Add the plants that searches find worse, and adapt the controller to these."""
         working, point, J = self.working.on_worse_plants(
             models, self.point, seeds, excess, report, count, options.model
         )
         return replace(self, working=working, point=point, objective=J)
 
-    def adapted(self, options: JointSearchOptions) -> "JointState":
-        """With the controller adapted to the plants."""
+    def adapt(self, options: JointSearchOptions) -> "JointState":
+        """Adapt the controller to the plants."""
         model = JointModel(
             self.problem, self.plants.models, self.point, self.reach, options=options.model
         )
-        point, J = model.adapted()
+        point, J = model.adapt()
         return replace(self, point=point, objective=J)
 
     def proposal(
@@ -163,8 +163,8 @@ class JointState:
         """The next step and what it promises, from the store where `key` of a `kind` is there."""
         curved = _has_basis(self.problem)
         make = partial(
-            proposed, self.problem, self.plants.models, self.point, self.reach, least_gain, curved,
-            options.model,
+            propose_step, self.problem, self.plants.models, self.point, self.reach, least_gain,
+            curved, options.model,
         )  # fmt: skip
         found = self.working.sampler.cached(kind, key, Proposal, make)
         if report is not None and np.isfinite(self.objective):
@@ -173,11 +173,11 @@ class JointState:
             report(f"J {self.objective:.{digits}g}, predicted gain of a {step} {gain:.2g}")
         return found
 
-    def stepped(
+    def take_step(
         self, proposal: Proposal, plants: Around, poor_share: float, options: JointSearchOptions
     ) -> "JointState":
         """After a step: taken where J falls, with the reach by the share of the gain that came."""
-        there = replace(self, point=proposal.end, plants=plants).adapted(options)
+        there = replace(self, point=proposal.end, plants=plants).adapt(options)
         gained, reach = self.objective - there.objective, self.reach
         if gained > options.good_share * proposal.gain:
             reach = min(options.growth * reach, options.largest_reach)
@@ -245,9 +245,9 @@ def joint_search(
         state = state.with_worse_plants(
             state.plants.models, (turn,), excess, report, options, options.lattice_on_way
         )
-        J, reduced = state.objective, state.working.reduced(state.plants.models, state.point)
+        J, reduced = state.objective, state.working.reduce(state.plants.models, state.point)
         state = replace(state, working=reduced)
-        if _arrived(state, ends or (), options):
+        if _has_arrived(state, ends or (), options):
             return JointEnd(sampler, first, False)
         if not np.isfinite(J):
             break
@@ -262,7 +262,7 @@ def joint_search(
         state = replace(state, previous=J)
         if proposal.gain > settles * abs(J) and state.reach > options.least_reach:
             plants = state.plants.at(state.problem, proposal.end, options.basis_reach)
-            state = state.stepped(proposal, plants, options.poor_share, options)
+            state = state.take_step(proposal, plants, options.poor_share, options)
             continue
         if settled := ends is not None:
             break
@@ -288,9 +288,9 @@ def joint_search(
 def _after_poll(
     state: JointState, turn: int, report: Report, options: JointSearchOptions
 ) -> JointState:
-    """At the best of the places further away, on its own plants."""
+    """Move to the best of the places further away, on its own plants."""
     problem = state.problem
-    place = polled(problem, state.plants.models, state.point, options)
+    place = poll(problem, state.plants.models, state.point, options)
     plants = Around.of(problem, place)
     other = replace(state, point=place, plants=plants, reach=options.first_reach)
     other = other.with_worse_plants(plants.models, (turn,), options.excess_on_way, report, options)
@@ -300,7 +300,7 @@ def _after_poll(
     return other
 
 
-def polled(
+def poll(
     problem: CoDesignProblem,
     models: Sequence[Evaluate],
     best: JointPoint,
@@ -318,7 +318,7 @@ def polled(
         if _distance(problem, z, best.theta) > 0.5 * options.poll_step
     ]
     ends = [
-        JointModel(problem, models, replace(best, theta=z), 0.0, options=options.model).adapted()
+        JointModel(problem, models, replace(best, theta=z), 0.0, options=options.model).adapt()
         for z in far
     ]
     return min(ends, key=lambda end: end[1], default=(best, np.inf))[0]
@@ -329,7 +329,7 @@ def _has_basis(problem: CoDesignProblem) -> bool:
     return plant_of(problem).nearby is not None
 
 
-def _arrived(
+def _has_arrived(
     state: JointState, ends: Sequence[tuple[Array, float]], options: JointSearchOptions
 ) -> bool:
     """Whether a place is that of a known end, and not better."""
@@ -363,7 +363,7 @@ def with_last_steps(
     reach = options.first_reach if curved else options.first_order_reach
     state = replace(before, working=before.working.whole, reach=reach)
     plants = state.plants.at(state.problem, state.point, options.basis_reach)
-    state = replace(state, plants=plants).adapted(options)
+    state = replace(state, plants=plants).adapt(options)
     for step in range(1, options.final_steps):
         if ends_early("last joint step"):
             break
@@ -373,7 +373,7 @@ def with_last_steps(
         if not coarse:
             exact = state.plants.at(state.problem, state.point, options.basis_place)
             if exact is not state.plants:
-                state = replace(state, plants=exact).adapted(options)
+                state = replace(state, plants=exact).adapt(options)
                 continue
         if proposal.gain <= options.final_gain * abs(J):
             true = nearby(state.problem, (), state.point.theta)
@@ -384,7 +384,7 @@ def with_last_steps(
             continue
         within = options.basis_reach if coarse else options.basis_place
         plants = state.plants.at(state.problem, proposal.end, within)
-        moved = state.stepped(proposal, plants, options.good_share, options)
+        moved = state.take_step(proposal, plants, options.good_share, options)
         taken = moved.point is not state.point
         state = moved
         if taken:
@@ -400,8 +400,8 @@ def objectives_beside(
     thetas: Array,
     options: JointSearchOptions = JointSearchOptions(),
 ) -> Array:
-    """By how much J is larger at θ (n, n_θ) beside a sample, by searches of its controller on
-    models of the plants around it; where J falls, of the best controller there too."""
+    """Compute by how much J is larger at θ (n, n_θ) beside a sample, by searches of its controller
+    on models of the plants around it; where J falls, of the best controller there too."""
     here = JointPoint(sample.theta, sample.kappa, sample.bandwidth)
     model, models = options.model, Around.of(problem, here).models
     places = [here.theta, *(tuple(theta.tolist()) for theta in thetas)]
@@ -409,7 +409,7 @@ def objectives_beside(
     def climbed(start: JointPoint) -> list[tuple[JointPoint, float]]:
         starts = (replace(start, theta=place) for place in places)
         return [
-            JointModel(problem, models, one, 0.0, options=model).adapted(model.steps)
+            JointModel(problem, models, one, 0.0, options=model).adapt(model.steps)
             for one in starts
         ]
 

@@ -15,7 +15,7 @@ Rows within 1e-3 of their bounds may carry μ too, and then count by μ times wh
 Where they are met a convex combination of the sides' gradients is balanced by A (stationary in the
 sense of Clarke), and no direction of θ, κ and τ that the bounds allow makes J fall to first order.
 All that is by derivatives at the design, of its controller and what that can be moved to. Whether
-another controller is the better one beside it, true values there tell (`Kink.slopes`): with one
+another controller is the better one beside it, true values there decide (`Kink.slopes`): with one
 direction left its two sides are all that there is, of several directions some are looked along.
 """
 
@@ -167,7 +167,7 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 def _slopes(
     bounds: Box, more: Beside, theta: Array, Z: Array, size: float, step: float
 ) -> tuple[tuple[float, float], ...]:
-    """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
+    """Compute how J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are evaluated at once."""
     sides = np.array([sign * step * z for z in Z.T for sign in (-1.0, 1.0)])
     ends = np.clip(theta + sides * bounds.width, *bounds)

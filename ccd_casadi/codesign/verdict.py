@@ -74,7 +74,7 @@ class State(StrEnum):
 
 
 class OwnSet(StrEnum):
-    """What is known of the loop on the case's own set of plants: `set` of the line `survives`.
+    """The knowledge of the loop on the case's own set of plants: `set` of the line `survives`.
 
     Attributes
     ----------
@@ -133,12 +133,12 @@ class Check:
 
     @property
     def details(self) -> tuple[str, ...]:
-        """What else is known, a clause each."""
+        """The clauses beyond the sentence, one each."""
         return split(self.clauses)[1]
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of `verdict` in result.json."""
+        """The entry of `verdict` in result.json."""
         words, details = split(self.clauses)
         return {
             "state": self.state.value, "reason": self.reason.key, "words": words,
@@ -173,7 +173,7 @@ class Check:
 def split(
     clauses: Sequence[str], options: VerdictOptions = VerdictOptions()
 ) -> tuple[str, tuple[str, ...]]:
-    """As many clauses as `most_words` hold as a sentence, and the others; a first one that is
+    """Split clauses into a sentence of at most `most_words` and the others; a first one that is
     longer is cut, and whole among the others."""
     held, count = 0, 0
     for clause in clauses:
@@ -203,7 +203,7 @@ def clauses_of(entry: Mapping[str, Any]) -> tuple[str, ...]:
     return (str(entry.get("words", "")), *map(str, entry.get("details", ())))
 
 
-def confirmed(line: Check, second: EngineComparison) -> Check:
+def confirm(line: Check, second: EngineComparison) -> Check:
     """`certified` with what a second engine says of the same loops."""
     state, found = line.state, (*line.findings, Reason.ENGINE_AGREES(loops=second.loops))
     if second.agrees is False:
@@ -269,7 +269,8 @@ def optimal(
 def search_evidence(
     starts: int, optima: int, global_check: GlobalCheck | None, gap: Finding | None = None
 ) -> tuple[tuple[Finding, ...], dict[str, Any]]:
-    """What IPOPT's starts, the global check over the box and bounds say, and its figures."""
+    """Write the evidence of IPOPT's starts, the global check over the box and bounds, and its
+    figures."""
     gap = Reason.GAP_UNKNOWN() if gap is None else gap
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     if global_check is None or not global_check.points:
@@ -282,7 +283,7 @@ def search_evidence(
     return (Reason.NONE_BETTER(), gap), figures
 
 
-def predicted(
+def judge_prediction(
     error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None,
     learnt: bool = False, options: VerdictOptions = VerdictOptions(),
 ) -> Check:  # fmt: skip

@@ -85,7 +85,7 @@ class Verified(ABC):
 
     @property
     def controller(self) -> StateSpace:
-        """The controller, SI."""
+        """The controller K(s), SI."""
         return self.design.controller
 
     @property
@@ -100,7 +100,7 @@ class Verified(ABC):
 
     @property
     def point(self) -> Array:
-        """Where the surrogates of the formulation are evaluated: θ, and their other inputs."""
+        """The input of the formulation's surrogates: θ, and their other inputs."""
         return np.array(self.theta)
 
     @property
@@ -114,15 +114,16 @@ class Verified(ABC):
 
     @abstractmethod
     def evidence(self, predicted: float) -> dict[str, Any]:
-        """What else its kind has to show, by keys of result.json; `predicted` is of its value."""
+        """Return the further evidence of this kind, by keys of result.json; `predicted` is of its
+        value."""
 
     def largest_at(self, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
-        """On which plant that the design was made on a figure of the judge is largest, in words,
-        and at which frequency (Hz); `peak_hz` is that of |S| of one plant."""
+        """Find the plant of the design on which each figure of the judge is largest, in words, and
+        the frequency (Hz); `peak_hz` is that of |S| of one plant."""
         return {"S_max": ("", peak_hz), "S_low": ("", bounds.omega_low / HZ)}
 
-    def proven(self) -> set[str]:
-        """Which of the judge's figures a proof holds on the whole set."""
+    def proven_figures(self) -> set[str]:
+        """Return the figures of the judge that a proof holds on the whole set."""
         return set()
 
     def checks(self) -> dict[str, bool]:
@@ -130,15 +131,16 @@ class Verified(ABC):
         return {}
 
     def controller_entry(self) -> dict[str, Any]:
-        """controller.json."""
+        """Write controller.json."""
         return controller_dict(self.controller)
 
     @abstractmethod
     def certified_line(self) -> Check:
-        """What its certificate rests on."""
+        """Write the line on what its certificate rests on."""
 
     def survives_line(self) -> Check:
-        """What the loop survives off its model, and whether the case's own set is kept."""
+        """Write the line on what the loop survives off its model, and whether the case's own set is
+        kept."""
         damping = "" if self.damping is None else self.damping.words
         line = survives(
             self.survival, S_max=self.problem.inner.S_max, other_damping=damping, **self.own_set()
@@ -147,32 +149,33 @@ class Verified(ABC):
         return replace(line, figures={**line.figures, "set_shift": list(held)})
 
     def own_set(self) -> dict[str, Any]:
-        """What `survives` takes of the case's own set of plants, and of closer models."""
+        """Return the arguments of `survives` about the case's own set of plants, and closer
+        models."""
         return {}
 
     @abstractmethod
     def better(self) -> Finding:
-        """What the whole inner problem has found better at θ, by `inner_gap`."""
+        """State what the whole inner problem has found better at θ, by `inner_gap`."""
 
     def no_gradient(self) -> Finding | None:
-        """Why J may have no gradient at θ; None where it always has one."""
+        """State why J may have no gradient at θ; None where it always has one."""
         return None
 
-    def searched(
+    def search_findings(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
-        """Where something better was searched for and not found, and figures of the line."""
+        """State where something better was searched for and not found, with figures of the line."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
         return search_evidence(starts, optima, global_check, self.bound())
 
     @cached_property
     def judgement(self) -> Judgement:
-        """On the plants as their function returned them."""
+        """The judgement on the plants as their function returned them."""
         return judge_on_model(self.problem, self.theta, self.controller)
 
     def bound(self) -> Finding:
-        """What no controller exceeds at θ."""
+        """State the bound that no controller exceeds at θ."""
         return Reason.GAP_UNKNOWN()
 
 

@@ -67,13 +67,13 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
 
 
 class Gap(Protocol):
-    """What is known of every controller, of the extension `limitations`."""
+    """The bound on every controller, of the extension `limitations`."""
 
     def finding(self, bandwidth: float) -> Finding:
-        """Of the verdict, with a design's ω_b in rad/s."""
+        """Make the finding of the verdict, with a design's ω_b in rad/s."""
 
     def entry(self, bandwidth: float) -> dict[str, Any]:
-        """Of result.json."""
+        """Write the entry of result.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ class VerifiedStructured(Verified):
         dω_b/d ln t in rad/s of every tolerance t.
     gap : Gap or None
         Of ω_b: what no controller reaches.
-    told : (float, Yield) or None
+    reported : (float, Yield) or None
         The time of its move in s, where J counts it.
     counterexamples : tuple of (option, point)
         Plants of the box by which judge or proof refute the design.
@@ -129,7 +129,8 @@ class VerifiedStructured(Verified):
 
     @cached_property
     def judgement(self) -> Judgement:
-        """Over the case's own bounds, of which the certificate is within `looseness`."""
+        """The judgement by the case's own bounds; the certificate's are within `looseness` of
+        them."""
         found, bounds = judgement_of(self.wide, self.checked), bounds_of(self.problem)
         if not self.wide.plants or not all(plant.stable for plant in self.wide.plants):
             return found
@@ -229,7 +230,7 @@ class VerifiedStructured(Verified):
             found[name] = (label, at.get(name, math.nan))
         return found
 
-    def proven(self) -> set[str]:
+    def proven_figures(self) -> set[str]:
         if not self.proof.applies:
             return set()
         raw = {"S_MAX": "S_max", "S_LOW": "S_low"}
@@ -272,7 +273,7 @@ class VerifiedStructured(Verified):
 
     @property
     def optima(self) -> tuple[BandwidthOptimum, ...]:
-        """Where the multi-start search at θ ended."""
+        """The ends of the multi-start search at θ."""
         return () if self.multistart is None else self.multistart.design.local_optima
 
     def better(self) -> Finding:
@@ -286,10 +287,10 @@ class VerifiedStructured(Verified):
     def bound(self) -> Finding:
         return super().bound() if self.gap is None else self.gap.finding(self.bandwidth)
 
-    def searched(
+    def search_findings(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
-        known, figures = super().searched(outcome, global_check)
+        known, figures = super().search_findings(outcome, global_check)
         if self.multistart is None:
             return known, figures
         ends, figure = Reason.MULTISTART(), self.problem.figure

@@ -44,16 +44,17 @@ class WorkingSet:
 
     @property
     def whole(self) -> "WorkingSet":
-        """With those aside too: at an end plants that bind in turns would bring each other back."""
+        """The set with the plants set aside too: at an end plants that bind in turns would bring
+        each other back."""
         return WorkingSet(with_scenarios(self.sampler, self.aside)) if self.aside else self
 
-    def reduced(
+    def reduce(
         self,
         models: Sequence[Evaluate],
         at: JointPoint,
         options: WorkingSetOptions = WorkingSetOptions(),
     ) -> "WorkingSet":
-        """Without the plants that do not hold the controller there, but with the model."""
+        """Drop the plants that do not hold the controller there, but keep the model."""
         problem = self.sampler.problem
         scenarios = state_of(problem).scenarios
         if len(scenarios) <= options.most_plants:
@@ -86,8 +87,8 @@ class WorkingSet:
         count: int,
         options: JointModelOptions,
     ) -> tuple["WorkingSet", JointPoint, float]:
-        """With the plants on which the controller exceeds a bound, the controller adapted to them,
-        and J there.
+        """Add the plants on which the controller exceeds a bound; return the set, the controller
+        adapted to it, and J there.
 
         `seeds`: the numbers of the searches for worse plants, one after the other, each elsewhere
         in the box, from a lattice of `count`; `within`: ln, by how much a plant may exceed."""
@@ -112,7 +113,7 @@ class WorkingSet:
                 back |= set(aside) & set(scenarios)
                 aside = tuple(one for one in aside if one not in scenarios)
             model = JointModel(sampler.problem, models, best, 0.0, options=options)
-            best, J = model.adapted()
+            best, J = model.adapt()
             if not np.isfinite(J):
                 break
         working = self if sampler is self.sampler else WorkingSet(sampler, aside, back)

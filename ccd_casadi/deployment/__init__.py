@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Timing:
-    """How a controller runs.
+    """The rate and the delay at which a controller runs.
 
     Attributes
     ----------

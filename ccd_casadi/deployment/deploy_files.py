@@ -97,15 +97,13 @@ def sections_of(
     """
     poles, zeros = _roots(K.poles), _roots(K.zeros(float(np.abs(K.poles).max())))
     gain = float((K.D - K.C @ np.linalg.solve(K.A, K.B))[0, 0])
-    pairs: list[tuple[Root | None, Root | None]] = [
-        *_matched(zeros, poles, True, options.pair_ratio)
-    ]
+    pairs: list[tuple[Root | None, Root | None]] = [*_match(zeros, poles, True, options.pair_ratio)]
     for zero in [z for z in zeros if z.damping is not None]:
         partner = _two_real(poles)
         if partner is not None:
             zeros.remove(zero)
             pairs.append((zero, partner))
-    pairs += _matched(zeros, poles, False)
+    pairs += _match(zeros, poles, False)
     pairs += [*((zero, None) for zero in zeros), *((None, pole) for pole in poles)]
     found = [_section(zero, pole, bandwidth / HZ, options) for zero, pole in pairs]
     found.sort(key=lambda s: abs((s.pole or s.zero or Root(0.0)).hz))
@@ -124,7 +122,7 @@ def _roots(values: np.ndarray) -> list[Root]:
     return found
 
 
-def _matched(
+def _match(
     zeros: list[Root], poles: list[Root], paired: bool, most: float = np.inf
 ) -> list[tuple[Root, Root]]:
     """Pairs of a zero and a pole, both complex (`paired`) or both real, the nearest first and none

@@ -31,7 +31,7 @@ from ccd_casadi.analysis.loop_channels import (
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
-from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.loop import tustin, zoh
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -44,7 +44,7 @@ from ccd_casadi.synthesis.weights import Weights
 
 
 class Reduction(StrEnum):
-    """How a controller was reduced."""
+    """The method by which a controller was reduced."""
 
     PERTURBATION = "singular perturbation"
     CLOSED_LOOP = "closed-loop balancing"
@@ -93,9 +93,9 @@ def reductions(
     plant = channel.plant
     K = channel.controller.in_units(plant.omega_0, plant.force)
     loop = closed_loop(plant.system, K).T
-    _, values = _balanced(K, loop, 0)
+    _, values = _truncate(K, loop, 0)
     order = int(np.sum(values > negligible * values[0]))
-    K, _ = _balanced(K, loop, order)
+    K, _ = _truncate(K, loop, order)
     found = []
     for r in range(order, 0, -1):
         for method, reduce in _METHODS.items():
@@ -143,11 +143,11 @@ def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | Non
 
 
 def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
-    """K with r states, balanced as in `_balanced`, those of the smallest values at rest.
+    """K with r states, balanced as in `_truncate`, those of the smallest values at rest.
 
     ẋ₂ = 0 of these, so that K(0) is kept.
     """
-    K, _ = _balanced(K, whole, len(K.A))
+    K, _ = _truncate(K, whole, len(K.A))
     rest = np.linalg.solve(K.A[r:, r:], np.hstack([K.A[r:, :r], K.B[r:]]))
     A2, B2 = rest[:, :r], rest[:, r:]
     return StateSpace(
@@ -158,7 +158,7 @@ def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
     )
 
 
-def _balanced(K: StateSpace, whole: StateSpace, order: int) -> tuple[StateSpace, Array]:
+def _truncate(K: StateSpace, whole: StateSpace, order: int) -> tuple[StateSpace, Array]:
     """K truncated to `order` in the coordinates in which its states, the last of a stable system
     `whole`, are as much driven as seen there; and the Hankel values."""
     A, B, C, n = whole.A, whole.B, whole.C, len(whole.A) - len(K.A)
@@ -192,7 +192,7 @@ class RateOptions:
 
 
 class Conversion(StrEnum):
-    """How K(s) becomes K(z): Tustin's rule, or ramp-invariant, with or without a lead.
+    """The rule by which K(s) becomes K(z): Tustin's, or ramp-invariant, with or without a lead.
 
     Ramp-invariant is exact for an error that is straight between samples; it needs the lower rate
     on every case measured. The lead is (1 + α) - α z⁻¹, whose phase is that of a time advance of αT
@@ -231,7 +231,7 @@ def discretise(
 
 @dataclass(frozen=True)
 class Target:
-    """What a sampled loop keeps: ‖S‖∞ <= (1 + excess) S_max, |ω_b/bandwidth - 1| <= tolerance."""
+    """The goals of a sampled loop: ‖S‖∞ <= (1 + excess) S_max, |ω_b/bandwidth - 1| <= tolerance."""
 
     S_max: float
     excess: float
@@ -259,7 +259,7 @@ def loop_at(
 ) -> SampledFigures:  # fmt: skip
     """The figures of the sampled loop; of several sensors on one actuator at these `places`."""
     K = discretise(controller, conversion, period, delay)
-    return loop_figures(closed_loop(sampled(plant, period, delay), K), places)
+    return loop_figures(closed_loop(zoh(plant, period, delay), K), places)
 
 
 def needed_rate(

@@ -39,7 +39,7 @@ class Term:
     source: int
 
     def of(self, z: Sequence[int]) -> int:
-        """Compute the term.
+        """Compute the term's integer product.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class FixedPoint:
     def step(
         self, X: Sequence[int], e: Sequence[int], f: Sequence[int]
     ) -> tuple[list[int], list[int], bool]:
-        """Compute one sample.
+        """Compute one sample of the controller in integers.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class FixedPoint:
 
 @dataclass(frozen=True)
 class FixedRequest:
-    """What is required of integers.
+    """The requirements on the integers of the code.
 
     Attributes
     ----------
@@ -258,7 +258,7 @@ def _terms(row: Array, bits: int) -> tuple[Term, ...]:
 
 
 def _matrix(rows: Rows, own: Array, z: Array, guard: int) -> Array:
-    """What the integers are in SI."""
+    """Convert the integers to a matrix in SI."""
     found = np.zeros((len(rows), len(z)))
     for i, row in enumerate(rows):
         for term in row:

@@ -53,7 +53,7 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
     if run.problem.sampling is None:
         return run
     at = run.problem.sampling
-    return _measured(replace(run, controller=tustin(run.controller, at.period), sampling=at))
+    return _measure(replace(run, controller=tustin(run.controller, at.period), sampling=at))
 
 
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
@@ -82,13 +82,13 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
         sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
         raise UserError(f"{path}: has {sizes}; this plant needs {p} and {m}")
     if not K.period:
-        figures = run.measured(run.plant, K)
+        figures = run.measure(run.plant, K)
         if not figures.certificate.stable:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
     sampling = Sampling(1.0 / K.period, 1e6 * delay)
-    found = _measured(replace(run, controller=K, sampling=sampling))
+    found = _measure(replace(run, controller=K, sampling=sampling))
     if not np.isfinite(found.figures.sensitivity_peak):
         growth = found.loop_on(run.plant.plant_si()).poles.real.max()
         words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
@@ -96,7 +96,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
     return found
 
 
-def _measured(run: FinishedRun) -> FinishedRun:
+def _measure(run: FinishedRun) -> FinishedRun:
     """The run with ω_b and ‖S‖∞ of its sampled loop; NaN where that is unstable."""
     loop = run.loop_on(run.plant.plant_si())
     f = loop_figures(closed_loop(*loop.as_run), loop.at)

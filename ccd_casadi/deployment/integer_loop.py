@@ -27,14 +27,14 @@ class ResponseSumOptions:
 
 @dataclass(frozen=True)
 class RoundingBound:
-    """What rounding adds."""
+    """The bound of what rounding adds to the outputs."""
 
     bits: int  # of a word
     errors: Array  # (p,) largest movement of each sensor, its unit; infinite where not known
 
     @property
     def largest(self) -> float:
-        """Of the first sensor, which a move is of."""
+        """The bound for the first sensor, which a move is of."""
         return float(self.errors[0])
 
 
@@ -84,14 +84,14 @@ def rounding_bound(
         0.5 * at_e, at_u * fixed.forces * (1.0 + lost_u), used,
         np.vstack([np.zeros((n, k)), np.diag(lost_x)]),
     ])  # fmt: skip
-    return RoundingBound(fixed.bits, _summed(loop.A, sources, loop.C_y, options))
+    return RoundingBound(fixed.bits, _sum_responses(loop.A, sources, loop.C_y, options))
 
 
 def _fractions(row: Sequence[Term]) -> int:
     return sum(term.shift > 0 for term in row)
 
 
-def _summed(A: Array, B: Array, C: Array, options: ResponseSumOptions) -> Array:
+def _sum_responses(A: Array, B: Array, C: Array, options: ResponseSumOptions) -> Array:
     """Σ_k |C A^k B| over all k and columns (p,)."""
     if not np.abs(np.linalg.eigvals(A)).max(initial=0.0) < 1.0:
         return np.full(len(C), np.inf)
@@ -114,7 +114,7 @@ def _summed(A: Array, B: Array, C: Array, options: ResponseSumOptions) -> Array:
 
 
 def rounding_finding(found: RoundingBound) -> Finding:
-    """What integers add."""
+    """State what integers add to the error."""
     why = Reason.ROUNDING if isfinite(found.largest) else Reason.ROUNDING_UNKNOWN
     return why(bits=found.bits, largest=found.largest)
 
@@ -122,7 +122,7 @@ def rounding_finding(found: RoundingBound) -> Finding:
 def integer_words(
     fixed: FixedPoint | None, rounding: RoundingBound | None, moved: OnHardware | None
 ) -> tuple[str, ...]:
-    """What the integers of the code are, what they add, and what they may spoil.
+    """Describe what the integers of the code are, what they add, and what they may spoil.
 
     Parameters
     ----------
@@ -147,7 +147,8 @@ def integer_words(
 
 
 def integer_faults(rounding: RoundingBound | None, moved: OnHardware | None) -> tuple[str, ...]:
-    """What integers may spoil: a move that saturates a word, roundings that leave its window.
+    """Describe what integers may spoil: a move that saturates a word, roundings that leave its
+    window.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class Electronics:
-    """What the electronics do.
+    """The imperfections of the electronics.
 
     Attributes
     ----------
@@ -127,9 +127,9 @@ def move(
         error[k] = aim * wanted[0, k] - rows @ x
         if actuators is not None:
             force[k] = actuators @ x
-        u, limited = controller(r - _stepped(y, hardware.sensor_step), ahead[k])
+        u, limited = controller(r - _quantise(y, hardware.sensor_step), ahead[k])
         clipped += limited
-        command[k] = _stepped(u, hardware.force_step)
+        command[k] = _quantise(u, hardware.force_step)
         now, end = float(k), k + 1.0
         while now < end:  # from one arrival to the next
             while arriving <= k and reaches[arriving] <= now + DelayOptions.instant:
@@ -219,7 +219,7 @@ def forward_of(
     return feedforward(replace(plant, C=row @ plant.C, D=row @ plant.D), period, delay) * row
 
 
-def _stepped(value: Array, step: float) -> Array:
+def _quantise(value: Array, step: float) -> Array:
     return np.asarray(step * np.round(value / step)) if step else value
 
 
@@ -356,7 +356,7 @@ def on_hardware(
 
 
 def hardware_dict(found: OnHardware) -> dict[str, Any]:
-    """For deploy.json; seconds, m and N."""
+    """Write the moves for deploy.json; seconds, m and N."""
     watched = SimulationOptions().watched
     return {
         "duration": found.profile.duration,

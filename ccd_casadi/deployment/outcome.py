@@ -55,7 +55,7 @@ class ChannelOrders:
 
 @dataclass(frozen=True)
 class Deployment:
-    """From a run's controller to the deployed one.
+    """The way from a run's controller to the deployed one.
 
     Attributes
     ----------
@@ -139,7 +139,8 @@ class Deployment:
 
     @property
     def shortfalls(self) -> tuple[str, ...]:
-        """What is not kept, on which plant, with its figure, the worst plant first.
+        """The requirements that are not met, each on its plant with its figure, the worst plant
+        first.
 
         ω_b is held to its tolerance on the nominal plant alone: on the others it moves with them.
         """
@@ -202,12 +203,13 @@ class DeployedRun:
 
     @property
     def reason(self) -> str:
-        """Why it is not verified; where it is, what hold and delay have taken of S_max."""
+        """The reason why it is not verified; where it is, what hold and delay have taken of
+        S_max."""
         return "; ".join(one.words() for one in self.findings)
 
     @property
     def findings(self) -> list[Finding]:
-        """Those of `reason`; of several plants that fall short that of the worst alone."""
+        """The findings of `reason`; of several plants that fall short that of the worst alone."""
         run, found = self.run, self.found
         parts = [Reason.RUN_NOT_VERIFIED(words=found.unverified)] if found.unverified else []
         if share := run.case.robust.share_words:
@@ -222,7 +224,7 @@ class DeployedRun:
 
     @property
     def _percent_over(self) -> float:
-        """By how many percent the largest peak exceeds S_max; negative below it."""
+        """The percentage by which the largest peak exceeds S_max; negative below it."""
         peak = self.found.worst.figures.sensitivity_peak
         return 100.0 * (peak / self.run.problem.inner.S_max - 1.0)
 
@@ -274,7 +276,8 @@ class DeployedRun:
 
     @property
     def order(self) -> str:
-        """As in `5 states: 4 after reduction (of 6; 7 synthesised), 1 of the lead filter`."""
+        """The order in words, such as `5 states: 4 after reduction (of 6; 7 synthesised), 1 of the
+        lead filter`."""
         run, found = self.run, self.found
         orders = [item.chosen.order for item in found.orders]
         if kind_of(run.problem).as_designed:

@@ -51,26 +51,26 @@ from ccd_casadi.deployment.robust_set import (
 )
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
+from ccd_casadi.fixed_structure.judgement import Judgement, attempt_judgement, judge_loops
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.between_samples import worst_between
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.text import HZ, plural
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.statics import compliance_of, statics_of
 
 
 @dataclass(frozen=True)
 class DeploymentOptions:
-    """What the deployed loop keeps of the designed one.
+    """The tolerances within which the deployed loop keeps the figures of the designed one.
 
     A reduced controller keeps S_max and a bound on the compliance to 0.5 %: they bind at most
     optima, where any change exceeds them a little.
@@ -152,7 +152,7 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     found, sensors = [], bool(bounds_of(run.problem).places)
     for channel, own, values in parts:
         K = channel.controller
-        figures = run.figures if sensors else run.measured(channel.plant, K)
+        figures = run.figures if sensors else run.measure(channel.plant, K)
         alone = ReducedController(len(K.A), Reduction.NONE, K, figures)
         found.append(ChannelOrders(channel, (alone,), alone, alone, (own, values)))
     return tuple(found)
@@ -164,8 +164,8 @@ DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_u
 
 @dataclass(frozen=True)
 class CodeForm:
-    """What is required of the code: its largest force in N, and whether it is of single
-    precision, or of integers."""
+    """The requirements on the code: its largest force in N, and whether it is of single precision,
+    or of integers."""
 
     saturation: float | None = None
     single: bool = False
@@ -245,32 +245,32 @@ def deploy(
         channels = tuple(item.channel for item in orders)
         small = [item.chosen.controller for item in orders]
         reduced = assemble(channels, small)
-        figures = run.measured(run.plant, reduced)
+        figures = run.measure(run.plant, reduced)
     way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
     code = CodeForm(saturation, single, fixed)
     if designed is not None:
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
         way |= {"needed_hz": own_hz, "target": target, "designed_for": designed}
-        found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, code, way)
-        return replace(found, judge=attempted(_judged, run, found))
+        found = _assess(run, dense, orders, Conversion.TUSTIN, rate, delay, code, way)
+        return replace(found, judge=attempt_judgement(_judge, run, found))
     loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + options.added_plants):
         conversion, needed, rate = choose(
             run, timing, loops, target, family, progress, attempt, remedy
         )
         way |= {"needed_hz": needed, "target": target}
-        found = _assessed(run, dense, orders, conversion, rate, timing.delay_at(rate), code, way)
+        found = _assess(run, dense, orders, conversion, rate, timing.delay_at(rate), code, way)
         outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
-    return replace(found, judge=attempted(_judged, run, found))
+    return replace(found, judge=attempt_judgement(_judge, run, found))
 
 
-def _judged(run: FinishedRun, found: Deployment) -> Judgement:
+def _judge(run: FinishedRun, found: Deployment) -> Judgement:
     """The coefficients of the code on the plants as their function returned them.
 
     W_KS KS and W_T T of the code are figures of it: a bound of theirs is one of the design.
@@ -294,7 +294,7 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
         return judged
     where = f" (broken at {', '.join(one.name for one in own.places)})" if own.places else ""
     kept = [f"S_max{where}", "S_low", *(["compliance_max"] if most is not None else [])]
-    words = f"stable and within {', '.join(kept)} on {counted(len(plants), 'plant')}"
+    words = f"stable and within {', '.join(kept)} on {plural(len(plants), 'plant')}"
     figures = dict(judged.figures)
     if own.weighted_level is not None:
         own = own if own.places else replace(own, channels=())
@@ -327,7 +327,7 @@ def _orders(
     def holds(peak: float) -> Callable[[ReducedController], bool]:
         def on(member: Member, row: ReducedController) -> bool:
             plant = member.seen_by(channel)
-            figures = run.measured(plant, row.controller)
+            figures = run.measure(plant, row.controller)
             kept = figures.certificate.stable and figures.sensitivity_peak <= peak
             return kept and compliant(plant, row)
 
@@ -343,7 +343,7 @@ def _orders(
     )
 
 
-def _assessed(
+def _assess(
     run: FinishedRun, members: Sequence[Member], orders: Sequence[ChannelOrders],
     conversion: Conversion, rate_hz: float, delay: float, code: CodeForm,
     way: Mapping[str, Any],
@@ -361,7 +361,7 @@ def _assessed(
     )
     nominal = Perturbation()
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
-    held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
+    held = {at: zoh(plant, period, delay) for at, plant in plants.items()}
     if code.fixed is not None:
         realisation = _of_integers(run, realisation, held[nominal], delay, code.fixed)
     realisation = in_single(realisation) if code.single else realisation

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
 from ccd_casadi.analysis.loop_channels import LoopChannel
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -59,14 +59,14 @@ class Realisation:
 
     @property
     def precision(self) -> str:
-        """What the code computes with, in words."""
+        """The arithmetic of the code, in words."""
         if self.fixed is not None:
             return f"fixed {self.fixed.bits}"
         return "single" if self.single else "double"
 
     @property
     def number(self) -> type[np.floating[Any]]:
-        """What the code computes with."""
+        """The floating-point type of the code."""
         return np.float32 if self.single else np.float64
 
     @property
@@ -77,7 +77,7 @@ class Realisation:
 
     @property
     def as_coded(self) -> StateSpace:
-        """Of the coefficients that the code has: nothing of A but its blocks."""
+        """The controller of the coefficients that the code has: nothing of A but its blocks."""
         inside = block_diag(*(np.ones((size, size)) for size in self.blocks))
         return replace(self.system, A=self.system.A * (inside if self.blocks else 1.0))
 
@@ -116,7 +116,7 @@ def realise(
     return Realisation(system, tuple(blocks), saturation)
 
 
-def realised(K: StateSpace) -> Realisation:
+def realise_blocks(K: StateSpace) -> Realisation:
     """A controller in discrete time as the code has it.
 
     Parameters
@@ -140,8 +140,8 @@ def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
     """
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
-    A, B, C = balanced(K.A, K.B, K.C)
-    A, T, sizes = _decoupled(A)
+    A, B, C = balance_system(K.A, K.B, K.C)
+    A, T, sizes = _decouple(A)
     B, C = np.asarray(np.linalg.solve(T, B), float), C @ T
     start = 0
     for size in sizes:
@@ -155,7 +155,7 @@ def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
     return StateSpace(A, B, C, K.D), sizes
 
 
-def _decoupled(A: Array, condition: float = 1e4) -> tuple[Array, Array, list[int]]:
+def _decouple(A: Array, condition: float = 1e4) -> tuple[Array, Array, list[int]]:
     """T⁻¹ A T, T and the sizes of its diagonal blocks: Bavely and Stewart's method (1979).
 
     Of the real Schur form block after block is split off by a Sylvester equation, and grows by the
@@ -278,7 +278,7 @@ def literals(values: Array, indent: int) -> str:
 
 
 def plain_title(title: str) -> str:
-    """Of letters that no comment of a program ends at."""
+    """Keep only letters that no comment of a program ends at."""
     return "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
 
 

@@ -146,7 +146,7 @@ def _points(
 
 
 def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
-    """Of a run with sections."""
+    """Return the plants of a run with sections."""
     uncertain = uncertain_plant(run.problem, run.theta)
     found: dict[SetPlace, Member] = {}
     for option, point in _points(run, uncertain, dense):

@@ -70,7 +70,8 @@ def drawn_axes(panel: Panel, width: float, height: float) -> tuple["Figure", "Ax
 
 
 def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
-    """What the page's scripts need to read values off the drawn curves and to enlarge a part."""
+    """Write the data by which the page's scripts read values off the drawn curves and enlarge a
+    part."""
     names = {i: curve.label for i, curve in enumerate(panel.curves) if curve.readable}
     scales = scales_of(axes, panel.log_x, panel.log_y)
     found = {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names}
@@ -126,7 +127,7 @@ def _draw(axes: "Axes", panel: Panel) -> None:
     if panel.legend is not None and (names := axes.get_legend_handles_labels()[1]):
         where, covered = labels.corner(names)
         if covered and panel.y_range is None:  # a strip above the curves is the legend's
-            _raised(axes, legend_height(names), panel.log_y)
+            _raise_top(axes, legend_height(names), panel.log_y)
             labels = _labels(axes, panel)
             where, _ = labels.corner(names)
         alone = len(names) == 1  # its name is enough
@@ -155,7 +156,7 @@ def _write(axes: "Axes", put: Put) -> None:
         made.arrow_patch.set_gid(f"leader-{at}")
 
 
-def _raised(axes: "Axes", strip: float, log: bool) -> None:
+def _raise_top(axes: "Axes", strip: float, log: bool) -> None:
     """Moves the top of the axes up by a strip, in pt of their height."""
     _, bottom, _, top = inside(axes)
     low, high = np.log(axes.get_ylim()) if log else np.array(axes.get_ylim())
@@ -243,7 +244,7 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
                       gid="mark-designs")  # fmt: skip
         if len(truths):
             x, y, hz = truths[np.isfinite(truths[:, 2])].T
-            # light and dark rings tell the dots from any colour of the map
+            # light and dark rings set the dots apart from any colour of the map
             axes.scatter(x, y, s=62, color=GROUND, zorder=2.9, clip_on=False, gid="mark-grounds")
             dots = axes.scatter(x, y, c=hz, cmap=svg.COLOUR_MAP, norm=norm, s=34, edgecolors=RING,
                                 linewidths=1.1, label=land.truth_label, zorder=3, clip_on=False,

@@ -187,7 +187,7 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """For each column whether no entry is a text."""
+        """Whether each column has numbers alone."""
         columns = range(len(self.head))
         return [all(not isinstance(row[i], str) for row in self.rows) for i in columns]
 
@@ -337,7 +337,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Words:
-    """A paragraph.
+    """A paragraph of a page.
 
     Attributes
     ----------
@@ -438,12 +438,12 @@ class Bars:
 
     @property
     def table(self) -> Table:
-        """Without the bars."""
+        """The same table without the bars."""
         return Table(self.head[:-1], self.rows)
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """Of the longest bar, in percent."""
+        """The lengths in percent of the longest bar."""
         most = max(map(abs, self.lengths), default=0.0) or 1.0
         return tuple(100.0 * length / most for length in self.lengths)
 
@@ -531,7 +531,7 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page.
+    """A whole page: its head and chapters.
 
     Attributes
     ----------

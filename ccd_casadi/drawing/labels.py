@@ -43,12 +43,12 @@ class Put:
 
     @property
     def across(self) -> str:
-        """Which side of the words is at the offset."""
+        """The side of the words that is at the offset."""
         return "center" if self.dx == 0 else "left" if self.dx > 0 else "right"
 
     @property
     def up(self) -> str:
-        """Which end of the words is at the offset."""
+        """The end of the words that is at the offset."""
         return "bottom" if self.dy >= 0 else "top"
 
     @property
@@ -64,13 +64,13 @@ def inside(axes: "Axes") -> Box:
 
 
 def legend_height(names: Sequence[str]) -> float:
-    """Of a legend of these names, in pt."""
+    """Return the height of a legend of these names, in pt."""
     return LINE * (len(names) + 0.8)
 
 
 def scales_of(axes: "Axes", log_x: bool = False, log_y: bool = False) -> list[list[float]]:
-    """Of both axes: their ends, whether logarithmic, and where these are in pt from the top left,
-    for the page's scripts."""
+    """Return the scales of both axes for the page's scripts: their ends, whether logarithmic, and
+    where these are in pt from the top left."""
     box, tall = inside(axes), 72.0 * axes.figure.bbox.height / axes.figure.dpi
     ends = (
         (axes.get_xlim(), log_x, box[0], box[2]),
@@ -123,7 +123,7 @@ class Labels:
         """The place of a legend of these names that covers least, and how much it covers; nothing
         lies over it then."""
         boxes = self._corners(names)
-        covered = self._covered(list(boxes.values()))
+        covered = self._count_covered(list(boxes.values()))
         costs = {where: float(n) + sum(_meet(box, one) for one in self._taken)
                  for (where, box), n in zip(boxes.items(), covered, strict=True)}  # fmt: skip
         where = min(costs, key=lambda each: costs[each])
@@ -131,7 +131,8 @@ class Labels:
         return where, costs[where]
 
     def words(self) -> list[Put]:
-        """Those of the marks and then of the levels, as far as there is a place for them."""
+        """Place the words of the marks and then of the levels, as far as there is a place for
+        them."""
         found = [self._beside(mark) for mark in self._panel.marks if mark.text]
         found += [self._along(level) for level in self._panel.levels if level.text]
         return [put for put in found if put is not None]
@@ -159,7 +160,7 @@ class Labels:
         self._curves = np.vstack([self._curves, points])
 
     def _beside(self, mark: Mark) -> Put | None:
-        """Beside a point, at its own offset in pt if that is free."""
+        """Place words beside a point, at its own offset in pt if that is free."""
         a, b = self._at(mark.x, mark.y)
         wide = LETTER * len(mark.text)
         places = []
@@ -171,8 +172,8 @@ class Labels:
         return self._best(places)
 
     def _along(self, level: Level) -> Put | None:
-        """At a line across the axes; upright beside a vertical one, or level with a place on it
-        where that alone keeps off the curves."""
+        """Place words at a line across the axes; upright beside a vertical one, or level with a
+        place on it where that alone keeps off the curves."""
         (left, bottom, right, top), vertical = self._inside, level.vertical
         corner = [low for low, _ in self._ranges]
         corner[not vertical] = level.value
@@ -199,19 +200,19 @@ class Labels:
         return float(a), float(b)
 
     def _best(self, places: Sequence[tuple[Box, Put]]) -> Put | None:
-        """Which place to take: inside the axes, free of labels, and the least over curves."""
+        """Choose a place: inside the axes, free of labels, and the least over curves."""
         left, bottom, right, top = self._inside
         free = [(box, put) for box, put in places
                 if left <= box[0] and box[2] <= right and bottom <= box[1] and box[3] <= top + LINE
                 and not any(_meet(box, one) for one in self._taken)]  # fmt: skip
         if not free:
             return None
-        box, put = free[int(np.argmin(self._covered([box for box, _ in free])))]
+        box, put = free[int(np.argmin(self._count_covered([box for box, _ in free])))]
         self._taken.append(box)
         return put
 
-    def _covered(self, boxes: Sequence[Box]) -> np.ndarray:
-        """How many points of curves lie in each box."""
+    def _count_covered(self, boxes: Sequence[Box]) -> np.ndarray:
+        """Count the points of curves in each box."""
         low_x, low_y, high_x, high_y = np.array(boxes).T[:, :, None]
         x, y = self._curves.T
         within = (low_x < x) & (x < high_x) & (low_y < y) & (y < high_y)

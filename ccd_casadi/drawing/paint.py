@@ -21,7 +21,7 @@ from ccd_casadi.drawing.surface import data, legend, still
 from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME, axis_label
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import plain, restored
+from ccd_casadi.support.json_files import plain, restore
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import number, package_text, printable, template
 from surrogates.files import write_whole
@@ -61,7 +61,7 @@ def tables_of(drawing: Drawing) -> tuple[Table, ...]:
 
 
 def _columns(panel: Panel) -> Iterator[Column]:
-    """What a panel shows, of loci over frequency both parts."""
+    """List the columns that a panel shows, both parts of loci over frequency."""
     named = any(curve.label for curve in panel.curves if curve.hz is not None)
     for curve in panel.curves:
         same = panel.y_label.startswith(curve.label)
@@ -269,7 +269,7 @@ def write_page(path: Path, page: Page, workers: Pool | None = None) -> None:
 def draw(path: Path, stored: Any, workers: Pool | None = None) -> None:
     """Draw a page from an entry of report.json, whose chapters may be called sections. Raises
     UserError where it is none."""
-    write_whole(path, page_html(_restored(path, stored), workers))
+    write_whole(path, page_html(_restore(path, stored), workers))
 
 
 def update_pages(folder: Path, change: Callable[[str, Page], Page]) -> dict[Path, str]:
@@ -289,7 +289,7 @@ def update_pages(folder: Path, change: Callable[[str, Page], Page]) -> dict[Path
     """
     try:
         stored = read_pages(folder)
-        pages = {name: _restored(folder / name, entry) for name, entry in stored.items()}
+        pages = {name: _restore(folder / name, entry) for name, entry in stored.items()}
     except UserError:
         return {}
     changed = {name: change(name, page) for name, page in pages.items()}
@@ -302,9 +302,9 @@ def update_pages(folder: Path, change: Callable[[str, Page], Page]) -> dict[Path
     return {folder / name: page.head.title for name, page in changed.items()}
 
 
-def _restored(path: Path, stored: Any) -> Page:
+def _restore(path: Path, stored: Any) -> Page:
     try:
-        return restored(Page, {"chapters": stored.get("sections"), **stored})
+        return restore(Page, {"chapters": stored.get("sections"), **stored})
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None

@@ -93,7 +93,8 @@ def middle_of(shapes: ModeShapes) -> Array:
 
 
 def data(shapes: ModeShapes) -> str:
-    """What the script needs, as compact JSON of whole numbers, safe inside a script element."""
+    """Write the data of the script as compact JSON of whole numbers, safe inside a script
+    element."""
     size = np.ptp(shapes.points, axis=0)
     unit = float(size.max()) / UNITS
     fields = []

@@ -47,7 +47,7 @@ class ModeShape:
 
     @property
     def places(self) -> str:
-        """`4 and 5`."""
+        """The numbers in words: `4 and 5`."""
         return " and ".join(map(str, self.numbers))
 
     @property
@@ -97,7 +97,7 @@ def outer_faces(faces: np.ndarray) -> np.ndarray:
     return faces[first[times == 1]]
 
 
-# After Okabe and Ito, told apart by the colour-blind and by a grey printer; each has a contrast of
+# After Okabe and Ito, distinct to the colour-blind and by a grey printer; each has a contrast of
 # at least 3.4 : 1 to white paper, which their pink, yellow and sky have not.
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, AMBER, BROWN = "#b8548c", "#a87000", "#8c564b"

@@ -34,17 +34,17 @@ class Affine:
 
     @cached_property
     def middle(self) -> Array:
-        """|centre|."""
+        """The sizes |centre|."""
         return np.asarray(np.abs(self.centre))
 
     @cached_property
     def reaches(self) -> Array:
-        """|slope| (n, N)."""
+        """The sizes |slope| (n, N)."""
         return np.asarray(np.abs(self.slope))
 
     @cached_property
     def reach(self) -> Array:
-        """How far from the centre the linear part goes at most."""
+        """The largest distance of the linear part from the centre."""
         return np.asarray(self.reaches.sum(0))
 
     @cached_property
@@ -193,7 +193,7 @@ def root(f: Affine) -> Affine:
 
 
 def sine(f: Affine) -> Affine:
-    """Of a real form."""
+    """Enclose the sine of a real form."""
     turned = exponential(f * 1j)
     return Affine(turned.centre.imag, turned.slope.imag, turned.rest)
 

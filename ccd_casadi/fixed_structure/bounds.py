@@ -65,7 +65,7 @@ def key_words(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelPeaks:
-    """What is held against a channel's own bounds; NaN where unknown.
+    """The figures that are held against a channel's own bounds; NaN where unknown.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class ShapeEnd(StrEnum):
 
 
 class BrokenAt(StrEnum):
-    """Where a channel's own |S| is taken.
+    """The place where a channel's own |S| is taken.
 
     Attributes
     ----------
@@ -248,8 +248,8 @@ class Bounds:
 
     @property
     def places(self) -> tuple[BreakPoint, ...]:
-        """Where loops of several sensors on one actuator are broken, that whose error counts first;
-        empty of other loops."""
+        """The places where loops of several sensors on one actuator are broken, that whose error
+        counts first; empty of other loops."""
         if self.error is None:
             return ()
         found = [BreakPoint(own.name, own.output, own.reference)
@@ -263,7 +263,8 @@ class Bounds:
         return self.shape is not None and self.shape_ends is ShapeEnd.S_MAX
 
     def room(self, x: Array) -> Array:
-        """How far above the line |S| = x/√2 through ω_b, x = ω/ω_b, the shape lets |S| be."""
+        """Compute how far above the line |S| = x/√2 through ω_b, x = ω/ω_b, the shape lets |S|
+        be."""
         assert self.shape is not None
         closed = (self.shape - 1.0) / np.maximum(x, 1.0) ** 2 if self.opens else 0.0 * x
         return np.asarray(self.shape - closed)
@@ -306,8 +307,9 @@ class Bounds:
             channels=tuple(replace(own, S_max=times(own.S_max)) for own in self.channels),
         )
 
-    def missed(self, name: str, ratio: float) -> str:
-        """How a controller misses a bound by a factor, and the value of its key that it meets."""
+    def missed_words(self, name: str, ratio: float) -> str:
+        """Describe how a controller misses a bound by a factor, and the value of its key that it
+        meets."""
         kind, channel = kind_and_channel(name)
         known = {"S_MAX": self.S_max, "S_LOW": self.S_low, "KS": self.weighted_level,
                  "T": self.weighted_level, "GS": self.compliance_max}  # fmt: skip

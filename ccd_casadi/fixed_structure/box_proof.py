@@ -82,7 +82,7 @@ class BoxProofOptions:
 
 @dataclass(frozen=True)
 class Division:
-    """What a number of `boxes` prove: figures over bounds at most, by kind of bound.
+    """The result of a division into `boxes`: figures over bounds at most, by kind of bound.
 
     `exceeded`: a bound, the least factor by which a box exceeds it, and the middle of that box.
     """
@@ -94,7 +94,7 @@ class Division:
 
 @dataclass(frozen=True)
 class _Enclosed(Boxes):
-    """With their figures over bounds at most (M, N), and what moves the loop there."""
+    """Boxes with their figures over bounds at most (M, N), and what moves the loop there."""
 
     highest: Array
     spread: Array
@@ -125,17 +125,17 @@ def divide_one(
         highest = np.minimum(found.highest, known)  # what holds on a box holds on its halves
         here = _Enclosed(part.chart, part.low, part.high, highest, found.spread)
         is_open = here.worst > 1.0 + slack
-        levels = raised(levels, here.only(~is_open).levels(found.names))
+        levels = raise_levels(levels, here.only(~is_open).levels(found.names))
         here = here.only(is_open)
         waiting = here if waiting is None else waiting.beside(here)
         count = len(waiting.worst)
         stuck = spent >= enough and count > options.stuck_share * spent
         if not count or spent >= most or stuck:
-            return Division(raised(levels, waiting.levels(found.names)), spent)
+            return Division(raise_levels(levels, waiting.levels(found.names)), spent)
         order = np.argsort(-waiting.worst, kind="stable")
         first = min(options.batch, max(enough // options.batches, count // 4, 1))
         worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
-        part, known = _halved(worst), np.tile(worst.highest, 2)
+        part, known = _halve(worst), np.tile(worst.highest, 2)
 
 
 def _enclosed(family: LoopFamily, boxes: Boxes, shared: int, workers: Pool | None) -> Enclosures:
@@ -153,7 +153,7 @@ def _enclosed_here(family: LoopFamily, boxes: Boxes) -> Enclosures:
         return family.enclose(boxes)
 
 
-def raised(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
+def raise_levels(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
     """The larger one of each."""
     names = dict.fromkeys([*levels, *others])
     return {name: max(levels.get(name, 0.0), others.get(name, 0.0)) for name in names}
@@ -190,8 +190,8 @@ def _initial_boxes(family: LoopFamily, box: Array, decades: float) -> Boxes:
     return Boxes(chart, ends[..., 0].T, ends[..., 1].T)
 
 
-def _halved(boxes: _Enclosed) -> Boxes:
-    """Each box halved along the coordinate that moves its loop most.
+def _halve(boxes: _Enclosed) -> Boxes:
+    """Halve each box along the coordinate that moves its loop most.
 
     Not along one whose ends differ by rounding alone; a range over more than a factor of 4 at its
     geometric mean, and one of frequency from 0 at a tenth of its end.
@@ -217,7 +217,7 @@ def _halved(boxes: _Enclosed) -> Boxes:
 
 
 class ProofOutcome(StrEnum):
-    """How far a proof came; its value is the sentence that reports it."""
+    """The outcome of a proof; its value is the sentence that reports it."""
 
     PROVEN = "every bound holds, with its slack, on the whole box"
     LOOSER = "stable on the whole box; some bound is only proven with a larger factor"
@@ -244,7 +244,7 @@ NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.
 
 @dataclass(frozen=True)
 class Proof:
-    """What is proven on a box: every |figure| <= level times its bound.
+    """The proof on a box: every |figure| <= level times its bound.
 
     Attributes
     ----------
@@ -300,7 +300,8 @@ class Proof:
 
     @property
     def unproven(self) -> str:
-        """Why the proof does not apply, or is not of every bound; empty where it is of all."""
+        """The reason why the proof does not apply, or is not of every bound; empty where it is of
+        all."""
         return self.left if self.applies else self.outcome.value
 
     @property
@@ -498,7 +499,7 @@ def divide(
             name, factor, point = one.exceeded
             return Proof(ProofOutcome.REFUTED, slack, names, {}, one.boxes, option, point,
                          (name, factor))  # fmt: skip
-        levels = raised(levels, one.levels)
+        levels = raise_levels(levels, one.levels)
     highest = max(levels.values(), default=0.0)
     outcome = ProofOutcome.PROVEN if highest <= 1.0 + slack else ProofOutcome.LOOSER
     if not np.isfinite(highest):

@@ -23,7 +23,7 @@ Pair = tuple[Affine, Affine]  # D and N of N/D, or a pole and its residue
 
 
 class Chart(IntEnum):
-    """What the first coordinate of a box is."""
+    """The meaning of the first coordinate of a box."""
 
     LOW = 0  # ω over the unit
     HIGH = 1  # the unit over ω
@@ -91,7 +91,7 @@ class FrequencyAxis:
 
     @cached_property
     def residues(self) -> np.ndarray:
-        """R_λ of W."""
+        """The residues R_λ of W."""
         poles = np.array(self.low_pass)
         others = 1.0 - poles[:, None] / poles
         np.fill_diagonal(others, 1.0)
@@ -107,7 +107,7 @@ class FrequencyAxis:
 
     @cached_property
     def plain(self) -> "FrequencyAxis":
-        """Without W, as a force on the mechanics has it."""
+        """The axis without W, as a force on the mechanics has it."""
         return replace(self, low_pass=())
 
     @cached_property
@@ -117,7 +117,7 @@ class FrequencyAxis:
         parts = (self.factor(one + pole, one + 1.0, bare=True) for pole in self.low_pass)
         return tuple(N * inverse(D) for D, N in parts)
 
-    def lagged(self, gains: list[Affine]) -> Affine:
+    def lag(self, gains: list[Affine]) -> Affine:
         """Σ R_λ g(λ) h_λ of g(λ) for every λ; sampled."""
         n = len(gains[0].slope)
         total = gains[0] * 0.0
@@ -133,7 +133,7 @@ class FrequencyAxis:
         for pole in self.low_pass:
             each = [residue * inverse(p * -1.0 + pole) for p, residue in poles]
             gains.append(sum(each[1:], each[0]))
-        return self.lagged(gains)
+        return self.lag(gains)
 
     def factor(self, p: Affine, residue: Affine, bare: bool = False) -> Pair:
         """D and N of a pole, both times x; they vanish together nowhere. `bare`: without W, but for
@@ -181,7 +181,7 @@ class FrequencyAxis:
             N = N * turn
         found = N * inverse(apart * apart - square * full * turn * 2.0)
         if self.low_pass:
-            found += self.lagged([inverse(square * -1.0 + pole**2) for pole in self.low_pass])
+            found += self.lag([inverse(square * -1.0 + pole**2) for pole in self.low_pass])
         return found
 
     def _even_and_odd(self, square: Affine) -> tuple[Affine, Affine]:
@@ -227,7 +227,7 @@ class FrequencyAxis:
             found = found * turn
         if self.low_pass:
             one = self.x * 0.0
-            found = found + self.y * self.y * self.lagged([one + p**-2 for p in self.low_pass])
+            found = found + self.y * self.y * self.lag([one + p**-2 for p in self.low_pass])
         return self._per_y_squared(found)
 
     @property

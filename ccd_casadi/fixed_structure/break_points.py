@@ -6,7 +6,7 @@ With L = Σ_j G_j K_j, j over the sensors, the loop broken at sensor i or at the
 
 fractions of numbers, whatever the number of sensors. Numerator and denominator are sums over the
 same discs: modes of the plant, gains of the channels and y of `boxes`, K_j = K̂_j/y.
-`Fraction.enclosed` has the one inequality that all figures rest on.
+`Fraction.enclose` has the one inequality that all figures rest on.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class LoopNumbers:
-    """What the fractions of B boxes are made of, each as a middle and a radius.
+    """The quantities that the fractions of B boxes are made of, each as a middle and a radius.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class LoopNumbers:
         return np.asarray(middle + (self.radius * counted) @ np.abs(self.terms))
 
     def beside(self, gains: Array) -> Array:
-        """What modes that do not count add at rest with gains (B, c) at most, times y² (B,)."""
+        """Bound what modes that do not count add at rest with gains (B, c), times y² (B,)."""
         if self.rigid is None:
             return 0.0 * self.delta_y
         return np.asarray(self.most_of_y**2 * (self.seen(1.0 - self.counted) * gains).sum(axis=1))
@@ -133,13 +133,13 @@ class SensorFamily(LoopFamily):
         Up to ω_low free bodies are infinite beside all else: there every fraction is taken times
         y², of which each mode 1/s² makes y²/s², and what does not move freely counts as beside.
         """
-        found = self._enclosed(boxes, at_rest=False)
+        found = self._enclose(boxes, at_rest=False)
         near = self.near_rest(boxes)
         if not near.any():
             return found
-        return found.improved(near, self._enclosed(boxes.only(near), at_rest=True))
+        return found.improve(near, self._enclose(boxes.only(near), at_rest=True))
 
-    def _enclosed(self, boxes: Boxes, at_rest: bool) -> Enclosures:
+    def _enclose(self, boxes: Boxes, at_rest: bool) -> Enclosures:
         axis = axis_of(boxes, self.period, self.delay, at_rest, self.low_pass)
         held, free, damped = self._discs(boxes, axis)
         numbers, finite = self._numbers(axis, held, at_rest)
@@ -148,21 +148,19 @@ class SensorFamily(LoopFamily):
         each = [numbers.fraction((np.arange(count) != i).astype(float), True)
                 for i in range(count)]  # fmt: skip
         at_actuator = numbers.fraction(np.zeros(count), True)
-        figures = [one.enclosed() for one in (*each, at_actuator)]
+        figures = [one.enclose() for one in (*each, at_actuator)]
         S, over_y = figures[error][:2], figures[error][0]
         if self._integrator:  # S/y, near 0 Hz
-            over_y = numbers.fraction((np.arange(count) != error).astype(float), False).enclosed()[
-                0
-            ]
+            over_y = numbers.fraction((np.arange(count) != error).astype(float), False).enclose()[0]
         found = self._of_S(boxes, S, over_y)
         for own, figure in zip(self.bounds.channels, figures, strict=True):
             limit = (own.S_max or self.bounds.S_max) * inside
             found.append((f"S_MAX of {own.name}", figure[0] / limit, figure[1] / limit))
         if self.bounds.weighted_level is not None:
             own = (np.arange(count) == error).astype(float)
-            T = numbers.fraction(own, True, ahead=False).enclosed()[:2]
+            T = numbers.fraction(own, True, ahead=False).enclose()[:2]
             KS = _force(numbers, at_actuator, self.outputs)
-            found += self._weighted(boxes, self.bounds.weighted_level, KS, T)
+            found += self._enclose_weighted(boxes, self.bounds.weighted_level, KS, T)
         if self.bounds.compliance_max is not None:
             upper, lower = _compliance(numbers, at_actuator, free, error)
             limit = self.bounds.compliance_max * inside
@@ -178,7 +176,8 @@ class SensorFamily(LoopFamily):
     def _numbers(
         self, axis: FrequencyAxis, held: Discs, at_rest: bool
     ) -> tuple[LoopNumbers, np.ndarray]:
-        """What the loops are made of, and the boxes on which all of it is finite; 0 on others."""
+        """Compute what the loops are made of, and the boxes on which all of it is finite; 0 on
+        others."""
         one = np.ones(len(axis.y.rest))
         y = (axis.y.centre, axis.y.reach + axis.y.rest) if self._integrator else (one, 0.0 * one)
         gains = [gain_of(*part, axis, self._integrator) for part in self.parts]
@@ -198,7 +197,7 @@ class SensorFamily(LoopFamily):
         return LoopNumbers(y_c, delta_y, m, r, k, of_k, p, of_p, terms, rigid), finite
 
     def _spread(self, held: Discs, finite: np.ndarray, moved: Array, of_all: Fraction) -> Array:
-        """How much each coordinate moves the loop (1 + n_p, N)."""
+        """Bound how much each coordinate moves the loop (1 + n_p, N)."""
         n = len(held.middle)
         weight = np.where(finite[:, None], moved[:, :n], 1.0)
         shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
@@ -217,7 +216,7 @@ def _force(numbers: LoopNumbers, whole: Fraction, outputs: Array) -> tuple[Array
     gains, of_gains = outputs @ numbers.gains.T, np.abs(outputs) @ numbers.of_gains.T
     for gain, radius in zip(gains, of_gains, strict=True):
         N = np.abs(gain) * at_rest
-        upper, lower, _, good = replace(whole, above=N, of_above=0.0 * whole.of_above).enclosed()
+        upper, lower, _, good = replace(whole, above=N, of_above=0.0 * whole.of_above).enclose()
         left = _least_of(whole, good)
         parts.append((upper + at_rest * radius / left, np.maximum(lower - radius / left, 0.0)))
     most, least = (np.linalg.norm(side, axis=0) for side in zip(*parts, strict=True))
@@ -247,6 +246,6 @@ def _compliance(
         np.concatenate([0.0 * whole.of_above, of_above], axis=1),
         np.concatenate([whole.of_below, 0.0 * of_above], axis=1),
         np.concatenate([whole.radius, e], axis=1), whole.beside,
-    ).enclosed()  # fmt: skip
+    ).enclose()  # fmt: skip
     left = np.where(good, left / _least_of(whole, good), np.inf)
     return upper + left, np.maximum(lower - left, 0.0)

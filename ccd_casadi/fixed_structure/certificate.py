@@ -5,8 +5,8 @@ Of plants with several inputs and outputs the whole loop is judged, by largest s
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
 stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
 zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. Of
-every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raised`). A sampled
-loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
+every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raise_tops`). A
+sampled loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
 `lti.between_samples`). Its GS and weighted KS and T are products of functions of z and of s, which
 no Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
 GS of a wired plant is S times its mechanics, of a force on these, and known there too; where
@@ -33,7 +33,7 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     CurveOptions,
     crossing_and_bandwidth,
     grid_through,
-    padded,
+    pad,
     peaks,
     with_crossings,
 )
@@ -47,11 +47,11 @@ from ccd_casadi.fixed_structure.certificate_responses import (
 )
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, strictly_proper, weighted
+from ccd_casadi.lti.state_space import StateSpace, filter_outputs, strictly_proper
 from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.text import HZ, plural
 from ccd_casadi.support.worker_process import one_blas_thread
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class PlantFigures(LoopPeaks):
 
 @dataclass(frozen=True)
 class SetCertificate:
-    """What the judge found on every plant.
+    """The judgement of a controller on every plant.
 
     Attributes
     ----------
@@ -195,7 +195,7 @@ def certify(
         for part in parts
     }
     each: dict[int, PlantFigures] = {}
-    for part, figures_of in results(workers, judged, tasks):
+    for part, figures_of in results(workers, judge_plants, tasks):
         each |= zip(part, figures_of, strict=True)
     found = [each[i] for i in range(len(systems))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
@@ -223,14 +223,14 @@ def certify(
     elif lost:
         words = f"the peak of S on plant {lost[0]} is not confirmed by the level test"
     else:
-        words = f"stable and within every bound on {counted(len(found), 'plant')}"
+        words = f"stable and within every bound on {plural(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
     products = ("KS", "T", "GS") if sampling is not None else ("GS",) if bare else ()
     untested = tuple(name for name in worst if kind_and_channel(name)[0] in products)
     return SetCertificate(passed, bandwidth, tuple(found), worst, words, untested)
 
 
-def judged(
+def judge_plants(
     plants: Sequence[StateSpace],
     controller: StateSpace,
     bounds: Bounds,
@@ -286,7 +286,7 @@ def _grid_of(loops: LoopsAsRun, bounds: Bounds, options: JudgeOptions) -> Array:
                 roots, loops.sampling, bounds.omega_low, _size(own), corner, options.curves
             )
         )
-    return padded(grids)
+    return pad(grids)
 
 
 def _figures_of(
@@ -312,7 +312,7 @@ def _figures_of(
         tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
         beyond_half_the_rate = np.where(larger, at, 0.0)
     for k, (S, G, plant) in enumerate(zip(loops.S, loops.G, given, strict=True)):
-        _raised(tops, k, S, G, loops.K, bounds, table, plant)
+        _raise_tops(tops, k, S, G, loops.K, bounds, table, plant)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
     whole = loops.S
     if bounds.error is not None:
@@ -372,7 +372,7 @@ def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Arra
     return np.asarray(lowest * shares[first][:, None])
 
 
-def _raised(
+def _raise_tops(
     tops: dict[str, tuple[Array, Array]], row: int, loop: StateSpace, G: StateSpace,
     K: StateSpace, bounds: Bounds, table: LoopResponses, plant: StateSpace,
 ) -> None:  # fmt: skip
@@ -397,14 +397,14 @@ def _raised(
             systems["GS"] = _moved(plant, K)
         if bounds.weights is not None:
             _, of_KS, of_T = bounds.weights.filters()
-            systems["weighted KS"] = weighted(KS, np.tile(of_KS, (len(K.C), 1)))
+            systems["weighted KS"] = filter_outputs(KS, np.tile(of_KS, (len(K.C), 1)))
             of_T[1] *= bounds.weights.delta or 1.0
-            systems["weighted T"] = weighted(T, np.tile(of_T, (p, 1)))
+            systems["weighted T"] = filter_outputs(T, np.tile(of_T, (p, 1)))
             for own in bounds.channels:
                 if own.M_K is not None:
                     one = np.array([own.force]) * (bounds.weights.M_K / own.M_K)
                     row_u = StateSpace(loop.A, loop.B, one @ of_u, one @ K.D)
-                    systems[f"weighted KS of {own.name}"] = weighted(row_u, of_KS[None])
+                    systems[f"weighted KS of {own.name}"] = filter_outputs(row_u, of_KS[None])
     for name, system in systems.items():
         value, at = tops[name]
         norm, place = hinf_norm(replace(system, period=period or 0.0), at[row])

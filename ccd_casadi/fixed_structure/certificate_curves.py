@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
-from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoom
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.arrays import Array
 
@@ -64,7 +64,7 @@ def grid_through(
     return frequency_grid(bottom, top, count, *special, apart=options.apart)
 
 
-def padded(grids: Sequence[Array]) -> Array:
+def pad(grids: Sequence[Array]) -> Array:
     """Grids (P, k) of one length: the shorter ones repeat their last frequency."""
     most = max(len(grid) for grid in grids)
     return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
@@ -86,7 +86,7 @@ def with_crossings(
         largest, floor = matrix[..., -1], np.full_like(grid, np.inf)
         scales = [np.ones_like(grid), *([weights[name]] if name in weights else [])]
         if name == "S":
-            scales.append(1.0 / counted(table, grid))
+            scales.append(1.0 / counted_frequencies(table, grid))
             past = np.maximum.accumulate(largest > HALF_POWER, axis=1)
             floor = np.where(past, np.inf, near * HALF_POWER)
             floor[:, 1:] = np.minimum(floor[:, 1:], floor[:, :-1])  # the bracket of the first too
@@ -111,7 +111,7 @@ def with_crossings(
 
 
 def _apart(points: Array, known: Array, apart: float) -> Array:
-    """Those that are not within `apart` (relative) of each other or of known ones."""
+    """Select the points that are not within `apart` (relative) of each other or of known ones."""
     joint = np.concatenate([known, np.sort(points)])
     order = np.argsort(joint, kind="stable")
     gaps = np.diff(joint[order], prepend=-np.inf, append=np.inf)
@@ -142,7 +142,7 @@ def peaks(
     def own(points: Array) -> Array:
         return np.asarray(np.stack(list(table.at(which, points).values()))[curve, rows])
 
-    where, peak = zoomed(own, grid[which, at - 1], grid[which, at + 1])
+    where, peak = zoom(own, grid[which, at - 1], grid[which, at + 1])
     for number, (value, frequency) in enumerate(tops.values()):
         mine = rows[curve == number]
         mine = mine[np.argsort(peak[mine])]  # of those of one plant the highest is written last
@@ -171,7 +171,7 @@ def crossing_and_bandwidth(
     # A peak between two points of the grid may pass -3 dB where both stay below.
     i, j = _maxima(grid, S, np.full(len(S), options.near * HALF_POWER))
     i, j = i[S[i, j] <= HALF_POWER], j[S[i, j] <= HALF_POWER]
-    where, peak = zoomed(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
+    where, peak = zoom(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
     most = int(np.bincount(i).max(initial=0))
     more, heights = np.tile(grid[:, -1:], most), np.tile(S[:, -1:], most)
     place = np.arange(len(i)) - np.searchsorted(i, i)
@@ -212,7 +212,7 @@ def _within_shape(
     bounds = table.bounds
 
     def room(x: Array, S: Array) -> Array:
-        return np.asarray(counted(table, x) / bounds.reached(S / HALF_POWER))
+        return np.asarray(counted_frequencies(table, x) / bounds.reached(S / HALF_POWER))
 
     short = bounds.shape_ends is ShapeEnd.CROSSING
     ends = crossing if short else grid[:, -1]
@@ -221,7 +221,7 @@ def _within_shape(
     value = np.concatenate([known, room(finer, table.sensitivity(which, finer, row))], axis=1)
     omega, value = _sorted(np.concatenate([grid, finer], axis=1), value)
     i, j = _maxima(omega, -value, -crossing / near)
-    where, least = zoomed(lambda x: -room(x, table.sensitivity(which[i], x, row)),
+    where, least = zoom(lambda x: -room(x, table.sensitivity(which[i], x, row)),
                            omega[i, j - 1], np.minimum(omega[i, j + 1], ends[i]))  # fmt: skip
     dips = np.concatenate([i, np.tile(np.arange(len(which)), 2)])
     last = np.argmax(np.where(omega <= ends[:, None], omega, 0.0), axis=1)
@@ -241,7 +241,7 @@ def _within_shape(
     return found
 
 
-def counted(table: LoopResponses, omega: Array) -> Array:
+def counted_frequencies(table: LoopResponses, omega: Array) -> Array:
     """The ω at which the shape is taken: without an integrator none below ω_low."""
     return omega if table.integrator else np.maximum(omega, table.bounds.omega_low)
 

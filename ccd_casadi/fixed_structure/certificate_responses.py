@@ -12,9 +12,9 @@ import numpy as np
 from scipy.linalg import expm, matrix_balance, schur
 
 from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ChannelBounds
-from ccd_casadi.lti.loop import Sampling, delayed
+from ccd_casadi.lti.loop import Sampling, with_delays
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, balanced, sigma_max
+from ccd_casadi.lti.state_space import StateSpace, balance_system, sigma_max
 from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
 
@@ -27,10 +27,10 @@ def error_response(G: StateSpace, K: StateSpace) -> StateSpace:
     return StateSpace(A, B, C, np.eye(len(G.C)))
 
 
-def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
+def zoh(G: StateSpace, sampling: Sampling) -> StateSpace:
     """u_k to y_k with the delay as whole periods and a rest, in which the older force still acts.
 
-    The judge's own, beside `lti.loop.sampled`.
+    The judge's own, beside `lti.loop.zoh`.
 
     ẋ = A x + B u with u held is integrated over both parts of a period by one exponential of
     [[A, B, 0], [0, 0, 1/T], [0, 0, 0]]-like blocks each.
@@ -39,7 +39,7 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     whole = int(np.floor(sampling.delay / T + 1e-9))
     rest = max(sampling.delay - whole * T, 0.0)
     if G.period:
-        return delayed(G.A, [0.0 * G.B] * whole + [G.B], G.C, G.period)
+        return with_delays(G.A, [0.0 * G.B] * whole + [G.B], G.C, G.period)
     held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
@@ -69,13 +69,13 @@ def as_run(K: StateSpace, sampling: Sampling) -> StateSpace:
 
 def holds(G: StateSpace, K: StateSpace, sampling: Sampling) -> bool:
     """Whether a controller in discrete time makes the loop stable, by its eigenvalues."""
-    loop = error_response(sampled(balanced_system(G), sampling), balanced_system(K))
+    loop = error_response(zoh(balanced_system(G), sampling), balanced_system(K))
     return bool(np.abs(np.linalg.eigvals(matrix_balance(loop.A)[0])).max() < 1.0)
 
 
 def balanced_system(system: StateSpace) -> StateSpace:
     """The same in coordinates in which A, B and C are balanced."""
-    A, B, C = balanced(system.A, system.B, system.C)
+    A, B, C = balance_system(system.A, system.B, system.C)
     return replace(system, A=A, B=B, C=C)
 
 
@@ -135,12 +135,12 @@ def loops_as_run(
     own, K = [balanced_system(plant) for plant in plants], balanced_system(controller)
     G, held = own, K
     if sampling is not None:
-        G, held = [sampled(one, sampling) for one in own], as_run(K, sampling)
+        G, held = [zoh(one, sampling) for one in own], as_run(K, sampling)
     free = [balanced_system(getattr(plant, "mechanics", plant)) for plant in plants]
     others = [getattr(plant, "counted", None) for plant in plants]
     driven = [balanced_system(one) for one in others if one is not None]
     if sampling is not None:
-        driven = [sampled(one, sampling) for one in driven]
+        driven = [zoh(one, sampling) for one in driven]
     if plants[0].period:  # what acts on it between its instants is not known
         free = G
     S = [error_response(one, held) for one in G]
@@ -168,10 +168,10 @@ class Triangular:
         step = max(1, 8192 // (s.shape[1] * m))  # numbers that stay in a processor's cache
         for first in range(0, len(s), step):
             part = slice(first, first + step)
-            found[part] = self._substituted(own[part], s[part])
+            found[part] = self._substitute(own[part], s[part])
         return found
 
-    def _substituted(self, own: np.ndarray, s: np.ndarray) -> np.ndarray:
+    def _substitute(self, own: np.ndarray, s: np.ndarray) -> np.ndarray:
         T, B, C, (N, k) = self.T[own], self.B[own], self.C[own], s.shape
         n, m = B.shape[1:]
         X = np.empty((N, n, k * m), complex)  # (s - T)⁻¹B
@@ -234,7 +234,7 @@ class LoopResponses:
         self, matrices: dict[str, np.ndarray], omega: Array, sizes: dict[str, Array] | None = None
     ) -> dict[str, Array]:
         if self.bounds.error is not None:
-            return self._broken(matrices, omega)
+            return self._break_loops(matrices, omega)
         found = sizes or {name: sigma_max(M) for name, M in matrices.items()}
         weights = self.weights(omega)
         found |= {f"weighted {name}": W * found[name] for name, W in weights.items()}
@@ -246,9 +246,9 @@ class LoopResponses:
                 found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
-    def _broken(self, matrices: dict[str, np.ndarray], omega: Array) -> dict[str, Array]:
-        """Of sensors that share an actuator: S, T and GS of the one whose error counts, and S of
-        the loop that is broken at each place."""
+    def _break_loops(self, matrices: dict[str, np.ndarray], omega: Array) -> dict[str, Array]:
+        """Compute for sensors that share an actuator S, T and GS of the one whose error counts, and
+        S of the loop that is broken at each place."""
         own = self.bounds.channels[self.bounds.error or 0]
         entry = entry_of(own, matrices["S"])
         found = {"S": np.abs(entry), "KS": sigma_max(matrices["KS"]), "T": np.abs(1.0 - entry),
@@ -316,7 +316,7 @@ class LoopResponses:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of matrices (..., p, q) and (..., q, m)."""
+    """Multiply matrices (..., p, q) and (..., q, m)."""
     return np.asarray(a * b if a.shape[-1] == 1 else a @ b)
 
 

@@ -34,7 +34,7 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, search_from_starts, started
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, search_from_starts, start_at
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -43,7 +43,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent, titled
+from ccd_casadi.support.terminal import Log, silent, with_title
 from ccd_casadi.support.worker_process import one_blas_thread
 
 
@@ -61,7 +61,7 @@ def synthesise_sections(
     initial: Sequence[Array] = (),
     only_initial: bool = False,
     frequencies: tuple[float, float] | None = None,
-    progress: Tell | None = None,
+    progress: Log | None = None,
     workers: Pool | None = None,
     options: DesignOptions | None = None,
 ) -> SectionsDesign:
@@ -123,7 +123,7 @@ def synthesise_sections(
     >>> design.certified, design.certificate.words
     (True, 'stable and within every bound on 2 plants')
     """
-    scaled, options = _scaled(plants, bounds, M_K), options or DesignOptions()
+    scaled, options = _scale(plants, bounds, M_K), options or DesignOptions()
     problem = problem_for(scaled, structure, bounds, sampling, frequencies, margin=options.margin)
     search = DesignSearch(problem, scaled, sampling, starts, most_starts, seed, initial,
                           only_initial, progress or silent, workers, options=options)  # fmt: skip
@@ -132,7 +132,7 @@ def synthesise_sections(
     return of_one_channel(search)
 
 
-def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]:
+def _scale(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]:
     """The plants, control systems in units of M_K: without one, of the weights or by the bounds,
     ω₀ of the first a decade above the least bandwidth that they ask for."""
     scale = M_K if bounds.weights is None else bounds.weights.M_K
@@ -155,7 +155,7 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
 
 
 def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesign:
-    """Each channel on its own, and then, where they are coupled, the whole loop."""
+    """Search each channel alone, and then, where they are coupled, the whole loop."""
     structure, only_initial = problem.structure, search.only_initial
     alike = in_search_units(search.plants, problem.bounds)
     if problem.separable:
@@ -164,8 +164,8 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
                  if not one.certified]  # fmt: skip
         if short:
             name, one = short[0]
-            return search.failed(one.outcome, f"channel {name}: {one.words}")
-        return _joined(search, problem, made)
+            return search.make_failure(one.outcome, f"channel {name}: {one.words}")
+        return _join(search, problem, made)
     field = _stable(problem, search.inside(search.initial))
     evaluations, known = len(search.initial), len(field)
     shared = min(len(M) for M in structure.directions) < len(structure.structures)
@@ -179,7 +179,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
         before: list[SectionsDesign] = []
         for share in search.options.peak_shares:
             before = _of_channels(search, problem, alike, share, before)
-            stack = _stacked(structure, before)
+            stack = _stack(structure, before)
             evaluations += 1
             fresh = _stable(problem, search.inside([stack])) if np.isfinite(stack).all() else []
             field += fresh
@@ -189,11 +189,11 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
             field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
             evaluations += len(field)
     if not field:
-        return search.failed()
-    tell = titled(search.tell, "whole loop")
-    runners = search_from_starts(problem, np.array(field), tell, search.workers, known=known,
+        return search.make_failure()
+    log = with_title(search.log, "whole loop")
+    runners = search_from_starts(problem, np.array(field), log, search.workers, known=known,
                        options=search.options.multi_start)  # fmt: skip
-    return search.concluded(runners, len(field), evaluations)
+    return search.conclude(runners, len(field), evaluations)
 
 
 def _of_sensors(
@@ -217,7 +217,7 @@ def _of_sensors(
         name = structure.decoupling.names[i]
         made = of_one_channel(replace(
             search, problem=alone, plants=plants, initial=[], began=perf_counter(),
-            tell=titled(search.tell, f"sensor {name} alone"),
+            log=with_title(search.log, f"sensor {name} alone"),
         ))  # fmt: skip
         if np.isfinite(made.kappa).all():
             kappa = idle.copy()
@@ -271,16 +271,16 @@ def _of_channels(
         title = f"channel {structure.decoupling.names[i]}"
         found.append(of_one_channel(replace(
             search, problem=alone, plants=members, initial=begins, began=perf_counter(),
-            only_initial=search.only_initial or again, tell=titled(search.tell, title),
+            only_initial=search.only_initial or again, log=with_title(search.log, title),
         )))  # fmt: skip
     return found
 
 
-def _joined(
+def _join(
     search: DesignSearch, problem: CompositeProblem, designs: Sequence[SectionsDesign]
 ) -> SectionsDesign:
     """The channels' designs as one, with the bandwidth of the slowest."""
-    kappa = _stacked(problem.structure, designs)
+    kappa = _stack(problem.structure, designs)
     inside = in_problem_units(problem, kappa)
     leads = (problem.bounds.lead(i) for i in range(len(designs)))
     slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(designs, leads, strict=True))
@@ -288,13 +288,13 @@ def _joined(
     point = Point(inside, tau, assess(problem, inside, tau))
     optima = (BandwidthOptimum(slowest, 1, tuple(map(float, kappa))),)
     starts = sum(one.starts for one in designs)
-    return search.designed(point, optima, starts, sum(one.evaluations for one in designs))
+    return search.make_design(point, optima, starts, sum(one.evaluations for one in designs))
 
 
-def _stacked(structure: ChannelStructure, designs: Sequence[SectionsDesign]) -> Array:
+def _stack(structure: ChannelStructure, designs: Sequence[SectionsDesign]) -> Array:
     """The channels' parameters in SI as one κ."""
     return np.concatenate([designs[i].kappa for i in structure.free])
 
 
 def _stable(problem: CompositeProblem, pool: Sequence[Array]) -> list[Array]:
-    return [kappa for kappa in pool if started(problem, kappa).assessment.stable]
+    return [kappa for kappa in pool if start_at(problem, kappa).assessment.stable]

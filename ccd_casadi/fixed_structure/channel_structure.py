@@ -268,7 +268,8 @@ def channel_plant(
 
 @lru_cache(maxsize=64)  # plants of a set are alike
 def _apart(coupled: bytes, states: int) -> tuple[int, np.ndarray]:
-    """How many parts of A have no entry between each other, and which one each state is of."""
+    """Count the parts of A that have no entry between each other, and find the part of each
+    state."""
     pattern = np.frombuffer(coupled, bool).reshape(states, states)
     count, group = scipy.sparse.csgraph.connected_components(pattern, directed=False)
     return int(count), group
@@ -290,13 +291,13 @@ def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
     if ((taken > 1e-12).sum(axis=1) <= 1).all():
         return True
     omega = np.geomspace(1e-3, 1e3, 19)  # over ω₀
-    if _coupled(whole, omega[::6]) or _coupled(whole, omega):
+    if _find_coupled(whole, omega[::6]) or _find_coupled(whole, omega):
         return False
     poles = np.linalg.eigvals(whole.A)
-    return not _coupled(whole, np.abs(poles[poles.imag >= 0.0]))
+    return not _find_coupled(whole, np.abs(poles[poles.imag >= 0.0]))
 
 
-def _coupled(whole: ScaledPlant, omega: Array, *, diagonal: float = 1e-7) -> bool:
+def _find_coupled(whole: ScaledPlant, omega: Array, *, diagonal: float = 1e-7) -> bool:
     """Whether |G_ij| is above `diagonal` of the mean of |G_ii| and |G_jj| at some ω over ω₀."""
     G = np.abs(whole.system.response(whole.system.off_poles(omega[omega > 0.0])))
     own = np.sqrt(np.einsum("kii->ki", G))
@@ -386,7 +387,7 @@ class ChannelStructure:
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Where in κ each parameter of `apart` is."""
+        """The place in κ of each parameter of `apart`."""
         return np.concatenate([np.arange(own.start, own.stop) for own in self.slices])
 
     @cached_property
@@ -402,12 +403,12 @@ class ChannelStructure:
 
     @cached_property
     def gains(self) -> np.ndarray:
-        """Which of the parameters are gains, (n,)."""
+        """Whether each parameter is a gain, (n,)."""
         return np.array([kind is ParameterKind.GAIN for kind in self.kinds])
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where each channel's parameters are in κ."""
+        """The slice of κ with each channel's parameters."""
         ends = np.cumsum([0, *(len(self.structures[i].names) for i in self.free)]).tolist()
         own = dict(zip(self.free, (slice(a, b) for a, b in pairwise(ends)), strict=True))
         return tuple(own[self.owner(i)] for i in range(len(self.structures)))

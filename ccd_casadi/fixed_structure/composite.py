@@ -83,7 +83,8 @@ class CompositeProblem(LoopProblem):
         return start, start + sizes[number]
 
     def split(self, rows: Rows) -> list[tuple[Part, np.ndarray, Rows]]:
-        """Each part with the indices of its rows, and these as it numbers them."""
+        """Split rows among the parts: each part with the indices of its rows, and these as it
+        numbers them."""
         found = []
         for number, part in enumerate(self.parts):
             start, end = self.rows_of(number)
@@ -92,7 +93,8 @@ class CompositeProblem(LoopProblem):
         return found
 
     def kinds_of(self, constraints: Constraints) -> list[str]:
-        """As `LoopProblem` has them, of channels with bounds of their own by channel."""
+        """Name the kinds of rows as `LoopProblem` does, those of channels with bounds of their own
+        by channel."""
         names = super().kinds_of(constraints)
         if not self.bounds.channels:
             return names
@@ -330,7 +332,7 @@ def answer_alike(
     a: Sequence[ScaledPlant], b: Sequence[ScaledPlant], *, tolerance: float = 1e-9
 ) -> bool:
     """Whether two channels' plants answer alike, to `tolerance` (relative), at enough frequencies
-    to tell rational functions of their order apart."""
+    to distinguish rational functions of their order."""
     first, second = plant_set(a), plant_set(b)
     if first.poles.shape != second.poles.shape:
         return False

@@ -22,9 +22,9 @@ from ccd_casadi.fixed_structure.multi_start import (
     SearchRun,
     arrivals,
     distinct,
-    finished,
+    finish,
     local_optima,
-    reinserted,
+    reinsert,
     search_from_starts,
 )
 from ccd_casadi.fixed_structure.plant_set import plant_set
@@ -35,7 +35,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.terminal import NotebookHtml, Tell, silent
+from ccd_casadi.support.terminal import Log, NotebookHtml, silent
 from ccd_casadi.support.text import HZ, number
 from ccd_casadi.support.time_budget import ends_early, time_is_up
 
@@ -80,7 +80,7 @@ class DesignOptions:
 
 
 class SectionsOutcome(StrEnum):
-    """How a synthesis ended; only CERTIFIED designs are to be used."""
+    """The outcome of a synthesis; only CERTIFIED designs are to be used."""
 
     CERTIFIED = "certified"
     NO_STABLE_START = "no start is stable on every plant of the set"
@@ -178,7 +178,7 @@ class DesignSearch:
     seed: int = 0
     initial: Sequence[Array] = ()
     only_initial: bool = False
-    tell: Tell = silent
+    log: Log = silent
     workers: Pool | None = None
     began: float = field(default_factory=perf_counter)
     options: DesignOptions = DesignOptions()
@@ -187,21 +187,21 @@ class DesignSearch:
         """Controllers κ in SI in the units of the problem and in its box."""
         return [np.clip(in_problem_units(self.problem, one), *self.problem.box) for one in kappas]
 
-    def judged(self, inside: Array) -> tuple[Array, StateSpace, SetCertificate]:
+    def judge(self, inside: Array) -> tuple[Array, StateSpace, SetCertificate]:
         """κ in SI of one in the problem's units, its controller, and its certificate."""
         structure, P = self.problem.structure, self.problem.plants
         kappa = structure.in_units(inside, P.omega_0, P.force)
-        K = structure.state_space(kappa).balanced()
+        K = structure.state_space(kappa).balance()
         return kappa, K, certify(self.plants, K, self.problem.bounds, self.sampling,
                                  integrator=structure.integrates(self.problem.bounds.error),
                                  workers=self.workers)  # fmt: skip
 
-    def designed(
+    def make_design(
         self, point: Point, optima: tuple[BandwidthOptimum, ...], starts: int, evaluations: int
     ) -> SectionsDesign:
         """The design at an end: certified where the judge confirms what the search found."""
         problem = self.problem
-        kappa, controller, judged = self.judged(point.kappa)
+        kappa, controller, judged = self.judge(point.kappa)
         found = optimality(problem, point)
         bandwidth = float(np.exp(point.tau)) * problem.plants.omega_0
         short: dict[str, float] = {}
@@ -213,7 +213,9 @@ class DesignSearch:
         outcome, words = SectionsOutcome.CERTIFIED, judged.words
         if short:
             outcome = SectionsOutcome.BOUND_NOT_MET
-            missed = ", ".join(problem.bounds.missed(name, ratio) for name, ratio in short.items())
+            missed = ", ".join(
+                problem.bounds.missed_words(name, ratio) for name, ratio in short.items()
+            )
             words = f"none found from {starts} starts: the nearest controller misses {missed}"
         elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
             outcome = SectionsOutcome.NOT_CERTIFIED
@@ -222,11 +224,11 @@ class DesignSearch:
             bandwidth = min(bandwidth, judged.bandwidth)
         return SectionsDesign(
             outcome, words, problem.structure, kappa, span_of(problem), controller, bandwidth,
-            judged, found.named(), found.ends, found.residual, short, optima, starts, evaluations,
+            judged, found.by_kind(), found.ends, found.residual, short, optima, starts, evaluations,
             self.seed, perf_counter() - self.began,
         )  # fmt: skip
 
-    def failed(
+    def make_failure(
         self, outcome: SectionsOutcome = SectionsOutcome.NO_STABLE_START, words: str = ""
     ) -> SectionsDesign:
         """A design without a controller."""
@@ -237,12 +239,10 @@ class DesignSearch:
             np.nan, None, {}, (), np.nan, {}, (), 0, 0, self.seed, perf_counter() - self.began,
         )  # fmt: skip
 
-    def concluded(
-        self, runners: Sequence[SearchRun], starts: int, spent: int = 0
-    ) -> SectionsDesign:
+    def conclude(self, runners: Sequence[SearchRun], starts: int, spent: int = 0) -> SectionsDesign:
         """The best end that the judge confirms, brought within its bounds; `spent`: loops that were
         assessed before."""
-        problem, ends = self.problem, finished(runners, self.options.multi_start)
+        problem, ends = self.problem, finish(runners, self.options.multi_start)
         evaluations = spent + sum(runner.evaluations for runner in runners)
         best: SectionsDesign | None = None
         optima = local_optima(problem, ends, self.options.multi_start)
@@ -254,13 +254,13 @@ class DesignSearch:
             last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
                           least_gain=1e-14)  # fmt: skip
             evaluations += last.evaluations
-            made = self.designed(last.point, optima, starts, evaluations)
+            made = self.make_design(last.point, optima, starts, evaluations)
             if best is None or (made.certified and not best.certified):
                 best = made
             if best.certified:
                 break
         assert best is not None
-        self.tell(f"{best.outcome.value}: {number(best.bandwidth / HZ, 4)} Hz")
+        self.log(f"{best.outcome.value}: {number(best.bandwidth / HZ, 4)} Hz")
         return best
 
 
@@ -315,14 +315,14 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     if not search.only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng, workers, options)])
     if not len(pool):
-        return search.failed()
+        return search.make_failure()
     last, started = search.only_initial, len(pool)
     first = search_from_starts(
-        problem, pool, search.tell, workers, known=known, last=last, options=rules
+        problem, pool, search.log, workers, known=known, last=last, options=rules
     )
     if last:
-        return search.concluded(first, started)
-    runners = _reworked(search, problem, first, rng)
+        return search.conclude(first, started)
+    runners = _rework(search, problem, first, rng)
     # known ones may be alike
     found, batch = arrivals(first, runners[0], rules) - max(known - 1, 0), 0
     least = min(options.least_starts, search.most_starts)
@@ -335,17 +335,17 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         started += len(pool)
         before, best = arrivals(runners, runners[0], rules), runners[0]
         field = search_from_starts(
-            problem, pool, search.tell, workers, runners, last=False, options=rules
+            problem, pool, search.log, workers, runners, last=False, options=rules
         )
         if field[0].merit > best.merit + rules.same:
-            runners = _reworked(search, problem, field, rng)
+            runners = _rework(search, problem, field, rng)
             found = arrivals(field, runners[0], rules)
         else:
             runners, found = field, found + max(arrivals(field, field[0], rules) - before, 0)
-    return replace(search.concluded(runners, started), found=found)
+    return replace(search.conclude(runners, started), found=found)
 
 
-def _reworked(
+def _rework(
     search: DesignSearch, problem: Problem, runners: list[SearchRun], rng: np.random.Generator
 ) -> list[SearchRun]:
     """Searches from the best ends with one section of each put elsewhere or drawn anew, as often as
@@ -359,11 +359,11 @@ def _reworked(
         fresh = [end for end in ends if not any(end is other for other in tried)]
         tried += fresh
         count = max(search.starts // 2, 1)
-        moved = stabilising(problem, reinserted(problem, fresh))[:count]
+        moved = stabilising(problem, reinsert(problem, fresh))[:count]
         more, like = count - len(moved), [end.kappa for end in ends]
         drawn = stabilising(problem, redraw_section(problem, like, options.pool // 2 * more, rng))
         pool = np.concatenate([moved, _nearest(problem, drawn, more, workers, options.batch)])
-        runners = search_from_starts(problem, pool, search.tell, workers, runners, known=len(moved),
+        runners = search_from_starts(problem, pool, search.log, workers, runners, known=len(moved),
                            options=options.multi_start)  # fmt: skip
         if runners[0].merit < best + options.multi_start.same:
             break

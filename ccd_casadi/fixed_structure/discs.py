@@ -15,8 +15,8 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class Discs:
-    """Of n modes over N boxes: `middle`, `radius` (n, N), and what each coordinate adds to the
-    latter (n, 1 + n_p, N)."""
+    """The discs of n modes over N boxes: `middle`, `radius` (n, N), and what each coordinate adds
+    to the latter (n, 1 + n_p, N)."""
 
     middle: np.ndarray
     radius: Array
@@ -27,8 +27,8 @@ def discs_of(
     plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: FrequencyAxis,
     free: bool,
 ) -> tuple[Discs, Discs, np.ndarray]:  # fmt: skip
-    """Of all modes as the loop has them, and where `free` as a force on the mechanics has them,
-    without hold, delay and low passes; where all flexible modes stay damped (N,)."""
+    """Enclose all modes as the loop has them, and where `free` as a force on the mechanics has
+    them, without hold, delay and low passes; where all flexible modes stay damped (N,)."""
     free &= axis.period is not None or bool(axis.low_pass)
     count = (len(plant.omega), 1 + len(names), low.shape[1])
     held, bare = (
@@ -170,8 +170,8 @@ class RankOneDiscs:
     inputs: Array | None = None
 
     def pushes(self, B: np.ndarray, Z: np.ndarray) -> Array:
-        """How far each moves e of `largest` per radius, to first order (N, n):
-        |B c_i|(|q_iᵀZ| + |b_i|)."""
+        """Bound how far each moves e of `largest` per radius, to first order (N, n): |B
+        c_i|(|q_iᵀZ| + |b_i|)."""
         return _lengths(B @ self.columns.T, 1) * self._seen(self.rows @ Z)
 
     def largest(self, A: np.ndarray, B: np.ndarray, Z: np.ndarray) -> Array:
@@ -301,7 +301,7 @@ class Fraction:
     radius: Array
     beside: Array
 
-    def enclosed(self) -> tuple[Array, Array, Array, np.ndarray]:
+    def enclose(self) -> tuple[Array, Array, Array, np.ndarray]:
         """Enclose |N/D|.
 
             N/D - S = (N - S D)/D = Σ δ_v (α_v - S β_v)/D,   S = N_c/D_c

@@ -60,8 +60,8 @@ class Enclosures:
     spread: Array
     bounded: np.ndarray
 
-    def improved(self, near: np.ndarray, rest: "Enclosures") -> "Enclosures":
-        """With what `rest` knows of the boxes `near`, upper bounds alone."""
+    def improve(self, near: np.ndarray, rest: "Enclosures") -> "Enclosures":
+        """Lower the upper bounds of the boxes `near` to those that `rest` has."""
         better = rest.highest.max(axis=0) < self.highest[:, near].max(axis=0)
         highest, spread, bounded = self.highest.copy(), self.spread.copy(), self.bounded.copy()
         highest[:, near] = np.minimum(rest.highest, highest[:, near])
@@ -197,7 +197,8 @@ class LoopDiscs:
         return FigureBounds(upper, least / (1.0 + self.q), by_disc, (moved + self.q) * h)
 
     def spread(self, worst: np.ndarray, figures: dict[str, FigureBounds]) -> Array:
-        """How much each coordinate moves the loop (1 + n_p, N), from what each moves the discs.
+        """Bound how much each coordinate moves the loop (1 + n_p, N), from what each moves the
+        discs.
 
         A disc counts by how far it moves M; with several `figures` by how far it moves the one that
         is furthest above its bound, `worst` (N,). It decides what is divided: no bound rests on it.
@@ -313,7 +314,7 @@ class LoopFamily:
         near = self.near_rest(boxes)
         if not near.any():
             return found
-        return found.improved(near, self._at_rest(boxes.only(near)))
+        return found.improve(near, self._at_rest(boxes.only(near)))
 
     def near_rest(self, boxes: Boxes) -> np.ndarray:
         """The boxes up to ω_low of a plant with free bodies, which are infinite at 0 Hz."""
@@ -330,7 +331,7 @@ class LoopFamily:
         found = self._of_S(boxes, figures["S"][:2], loop.a2)
         if level is not None:
             figures["KS"] = loop.KS()
-            found += self._weighted(boxes, level, figures["KS"][:2], figures["T"][:2])
+            found += self._enclose_weighted(boxes, level, figures["KS"][:2], figures["T"][:2])
         if compliance is not None:
             elsewhere = self.plant.counted is not None
             figures["GS"] = self._moved(loop) if elsewhere else loop.GS()
@@ -476,7 +477,7 @@ class LoopFamily:
         found = self._of_S(boxes, (S, none), a2)
         if level is not None:
             KS = ((1.0 + epsilon) * norm(K) + grain) * a2
-            found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
+            found += self._enclose_weighted(boxes, level, (KS, none), (1.0 + S, none))
         if compliance is not None and self.plant.counted is not None:
             y_most = axis.y.size**2
             grain_of = epsilon * np.abs(K[:, 0, 0]) + grain
@@ -500,7 +501,8 @@ class LoopFamily:
 
     @property
     def _integrator(self) -> bool:
-        """Of one output any channel's holds it, of several each has its own."""
+        """Whether an integrator holds the outputs: of one output any channel's does, of several
+        each has its own."""
         known = [own.integrator for own, _ in self.parts]
         return any(known) if len(self.outputs) == 1 else all(known)
 
@@ -580,7 +582,7 @@ class LoopFamily:
             found.append(("SHAPE", rising / room[0], least / room[1]))
         return found
 
-    def _weighted(
+    def _enclose_weighted(
         self, boxes: Boxes, level: float, KS: Range, T: Range
     ) -> list[tuple[str, Array, Array]]:
         """The same of KS and T; |W_KS| and |W_T| are monotone in ω: the ends of a box suffice."""

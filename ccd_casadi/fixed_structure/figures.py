@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     RowPlaces,
 )
 from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops
-from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, second, unseen
+from ccd_casadi.kernels.loop_grid import NONE, Answers, find_unseen, maxima, merge, second
 from ccd_casadi.kernels.loop_point import LoopArrays, close, levels, rows
 from ccd_casadi.kernels.modes import form_slopes
 from ccd_casadi.lti.frequency_grid import RootOptions
@@ -72,7 +72,7 @@ def frequency_grid(
     """
     fixed, base = problem.fixed, problem.base
     own, ends = roots[np.abs(roots) > 0.0], (float(base[0]), float(base[-1]))
-    v, place = merged(
+    v, place = merge(
         fixed, own, poles, np.array(RootOptions.flanks), ends, options.apart, options.top
     )
     return v, (place >= 0) & (place < len(base)), Answers(place, *problem.answers)
@@ -106,7 +106,7 @@ def hidden_peaks(
     curves: np.ndarray, v: Array, value: Array, options: PeakOptions = PeakOptions()
 ) -> Brackets:
     """Steps of the grid near a bound in which a flat maximum may lie that no grid point shows."""
-    found, ends = unseen(value, v, -options.hidden)
+    found, ends = find_unseen(value, v, -options.hidden)
     (i, c, k), (low, end) = found.T, ends.T
     return Brackets(curves[c], i + k * len(v), end, low, end)
 
@@ -266,7 +266,7 @@ def constraints(problem: LoopProblem, kappa: Array, tau: float, at: RowPlaces) -
 
 
 def evaluate_rows(problem: LoopProblem, kappa: Array, tau: float, at: RowPlaces) -> Any:
-    """What `kernels.loop_rows.rows` has of these rows; without the margin."""
+    """Evaluate these rows by `kernels.loop_rows.rows`; without the margin."""
     number, plant = np.divmod(at.plant, problem.plants.count)
     return rows(at.curve, number, plant, at.v, problem.loop(kappa, tau))
 
@@ -360,7 +360,7 @@ def hessians(
     shift = c_xy / np.where(top, -c_xx, np.inf)[:, None]
     out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]
     # The room of a shape opens with ω/ω_b: c_ττ, and c_xτ = -c_ττ but for the warped frequency.
-    closed = problem.closed(rows, tau)
+    closed = problem.closed_share(rows, tau)
     bending = 4.0 * closed / (1.0 - closed) ** 2
     c_xt = -bending * problem.plants.chain(rows.v)
     out[:, -1, :-1] += c_xt[:, None] * shift

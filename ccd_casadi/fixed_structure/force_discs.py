@@ -135,7 +135,7 @@ class ForceDiscs:
         for i in range(z.shape[1]):
             for j in range(d.shape[1]):
                 one = self.moved(c, b, z[:, i], d[:, j])
-                upper, lower, moved, _ = one.enclosed()
+                upper, lower, moved, _ = one.enclose()
                 squares += np.array([upper, lower]) ** 2
                 by_disc += moved[:, : 2 * n]
                 beside += (moved[:, 2 * n :] * one.radius[:, 2 * n :]).sum(axis=1)

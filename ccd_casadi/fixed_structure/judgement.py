@@ -21,8 +21,8 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate,
 from ccd_casadi.fixed_structure.certificate_responses import as_run, holds
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.errors import UserError, described
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.errors import UserError, describe
+from ccd_casadi.support.text import HZ, plural
 
 if TYPE_CHECKING:
     from ccd_casadi.plants.measured import MeasuredResponse
@@ -67,7 +67,7 @@ class Judgement:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Its entry in result.json."""
+        """The entry of result.json."""
         return {**vars(self)}
 
 
@@ -86,7 +86,7 @@ def judgement_of(certificate: SetCertificate, plants: int) -> Judgement:
     return Judgement(plants, certificate.worst, certificate.passed, certificate.words)
 
 
-def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
+def attempt_judgement(judge: Callable[..., Judgement], *of: Any) -> Judgement:
     """Call a judge and make its failure an unknown judgement.
 
     Parameters
@@ -102,7 +102,7 @@ def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
     try:
         return judge(*of)
     except (UserError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        return Judgement(0, {}, None, f"the judge has no answer: {described(error)}")
+        return Judgement(0, {}, None, f"the judge has no answer: {describe(error)}")
 
 
 def judge_loops(
@@ -199,14 +199,15 @@ def judge_lines(
     figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in figures.items()
               if not ratio <= 1.0 + JudgeOptions.tolerance]  # fmt: skip
-    words = f"stable and within every bound on {counted(len(hz), 'line')}"
+    words = f"stable and within every bound on {plural(len(hz), 'line')}"
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"
     return Judgement(1, figures, not broken, words, engine=AS_GIVEN)
 
 
 def together(each: Sequence[Judgement]) -> Judgement:
-    """Of one controller on several plants: passed where it is on all, unknown where on one."""
+    """Join the judgements of one controller on several plants: passed where it is on all, unknown
+    where on one."""
     if len(each) == 1:
         return each[0]
     names = dict.fromkeys(name for one in each for name in one.figures)

@@ -52,7 +52,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool, Workers, results
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, number, spoken
 from ccd_casadi.support.time_budget import ends_early
 
@@ -86,7 +86,7 @@ class Goal(Protocol):
     def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
         """∂ ln v/∂θ at a fixed κ; as `at`."""
 
-    def shown(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """v with its unit."""
 
 
@@ -112,7 +112,7 @@ class RmsError:
 
     @cached_property
     def variances(self) -> tuple[ErrorVariance, ...]:
-        """Those of every plant."""
+        """The variance of every plant."""
         rest = self.budget, self.hold, self.structure.order
         return tuple(ErrorVariance(plant.plant_si(), *rest) for plant in self.plants)
 
@@ -131,7 +131,7 @@ class RmsError:
         ]  # fmt: skip
         return self._of_mean(np.asarray(kappa, complex)[None], moved, workers)[1]
 
-    def shown(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(
@@ -184,7 +184,7 @@ def least_value(
     least_bandwidth: float = 0.0,
     initial: Sequence[Array] = (),
     only_initial: bool = False,
-    tell: Tell = silent,
+    log: Log = silent,
     workers: Pool | None = None,
     ended: Mapping[int, "Ended"] | None = None,
     options: LeastValueOptions = LeastValueOptions(),
@@ -202,7 +202,7 @@ def least_value(
     initial, only_initial : sequence of array (n,), bool
         κ in SI of further starts, which come first; `only_initial`: the design is a start only
         where these lead to no certified design.
-    tell : callable
+    log : callable
         Is given a line for each end.
     workers : Pool, optional
         With it descents are made `options.at_once`, however many its processes are.
@@ -259,10 +259,10 @@ def least_value(
         if ended is not None and len(begins) == len(ended):
             ends, ended = dict(ended), None
         elif len(begins) == 1 and near is not None:
-            ends = {0: _descended(descent, begins[0], known, near)}
+            ends = {0: _descend(descent, begins[0], known, near)}
         else:
             tasks = {i: (descent, x, tuple(known)) for i, x in enumerate(begins)}
-            ends = dict(results(workers, _descended, tasks))
+            ends = dict(results(workers, _descend, tasks))
         for i in range(len(begins)):
             start, end, count = ends[i]
             if start is None or end is None or _is_known(known, start):
@@ -272,10 +272,10 @@ def least_value(
             known += [start, end.x]
             if not new:
                 continue
-            made, conditions = _judged(search, end, design, floor, options.kept)
+            made, conditions = _judge(search, end, design, floor, options.kept)
             value = float(np.exp(end.value + options.reward * end.x[-1]))
-            at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
-            tell(f"{at}, {count} steps: {made.words}")
+            at = f"{goal.format_value(value)} at {number(made.bandwidth / HZ, 4)} Hz"
+            log(f"{at}, {count} steps: {made.words}")
             if made.certified and value < best.value:
                 direct = goal.to_theta(made.kappa, near)
                 envelope = envelope_of(problem, end.x[:-1], conditions, direct)
@@ -319,7 +319,7 @@ def first_descents(
     floor = _floor(problem, least_bandwidth, options)
     descent = _Descent(problem, goal, options.reward, floor)
     begins = [_begin(descent, kappa, options) for kappa in initial[: options.at_once]]
-    return {i: partial(_descended, descent, x, ()) for i, x in enumerate(begins)}
+    return {i: partial(_descend, descent, x, ()) for i, x in enumerate(begins)}
 
 
 def _floor(problem: LoopProblem, least_bandwidth: float, options: LeastValueOptions) -> float:
@@ -329,14 +329,14 @@ def _floor(problem: LoopProblem, least_bandwidth: float, options: LeastValueOpti
 
 @dataclass(frozen=True)
 class _Descent:
-    """What a descent of a goal needs, in any process."""
+    """The data of a descent of a goal, for any process."""
 
     problem: LoopProblem
     goal: Goal
     reward: float
     floor: float
 
-    def scaled(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
+    def evaluate(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
         """ln v and its gradient at κ in the problem's units."""
         units = self.problem.plants
         own = self.problem.structure.in_units(kappa, units.omega_0, units.force)
@@ -354,12 +354,14 @@ def _begin(descent: _Descent, kappa: Sequence[float] | Array, options: LeastValu
 Ended = tuple[Array | None, Iterate[Assessment] | None, int]
 
 
-def _descended(
+def _descend(
     descent: _Descent, x: Array, known: Sequence[Array], workers: Pool | None = None
 ) -> Ended:
-    """From x to where steps no longer help, or come to what is known: the start as it is, the end,
-    and how many loops were assessed; none of a start that is known or not stable."""
-    scaled = partial(descent.scaled, workers=workers or LentWorkers())  # the others may have ended
+    """Descend from x until steps no longer help, or end at what is known: the start as it is, the
+    end, and how many loops were assessed; none of a start that is known or not stable."""
+    scaled = partial(
+        descent.evaluate, workers=workers or LentWorkers()
+    )  # the others may have ended
     model = LoopModel(descent.problem, scaled, descent.reward, descent.floor)
     model.known = list(known)
     start = model.at(x)
@@ -374,13 +376,13 @@ def _is_known(known: Sequence[Array], x: Array) -> bool:
     return any(np.abs(x - other).max() <= LocalSearchOptions.merged for other in known)
 
 
-def _judged(
+def _judge(
     search: DesignSearch, end: Iterate[Assessment], design: SectionsDesign, floor: float,
     kept: float,
 ) -> tuple[SectionsDesign, Optimality]:  # fmt: skip
     """The end as a design, certified by the judge, and its conditions of optimality."""
     inside, tau = end.x[:-1], float(end.x[-1])
-    kappa, controller, judged = search.judged(inside)
+    kappa, controller, judged = search.judge(inside)
     found = optimality(search.problem, Point(inside, tau, end.data), -end.gradient, floor)
     least = float(np.exp(floor)) * search.problem.plants.omega_0
     good = judged.passed and judged.bandwidth >= least / kept
@@ -392,7 +394,7 @@ def _judged(
         controller=controller,
         bandwidth=judged.bandwidth,
         certificate=judged,
-        multipliers=found.named(),
+        multipliers=found.by_kind(),
         at_box=found.ends,
         kkt_residual=found.residual,
         short={},

@@ -63,7 +63,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Ascent:
-    """Where a local search is, the radius it has, and how many loops it assessed.
+    """The state of a local search: its point, its radius, and how many loops it assessed.
 
     `done`: further steps do not help.
     """
@@ -114,11 +114,13 @@ class LoopModel(TrustRegionModel[Assessment]):
         self.high = np.append(problem.box[1], top)
 
     def at(self, x: Array) -> Iterate[Assessment] | None:
-        """With every loop stable, and v finite."""
+        """Assess x, provided that every loop is stable and v is finite."""
         kappa = np.clip(x[:-1], *self.problem.box)
-        return self.assessed(kappa, float(x[-1]), assess(self.problem, kappa, float(x[-1])))
+        return self.make_iterate(kappa, float(x[-1]), assess(self.problem, kappa, float(x[-1])))
 
-    def assessed(self, kappa: Array, tau: float, found: Assessment) -> Iterate[Assessment] | None:
+    def make_iterate(
+        self, kappa: Array, tau: float, found: Assessment
+    ) -> Iterate[Assessment] | None:
         """The iterate of an assessment."""
         value, slope = 0.0, np.zeros(len(kappa))
         if found.stable and self.goal is not None:
@@ -140,7 +142,7 @@ class LoopModel(TrustRegionModel[Assessment]):
         slopes = np.column_stack([found.to_kappa, found.to_tau])
         return Rows(found.value, slopes, hessians=second, curved=len(peaks.v))
 
-    def learnt(
+    def learn(
         self,
         H: Array,
         here: Iterate[Assessment],
@@ -153,8 +155,8 @@ class LoopModel(TrustRegionModel[Assessment]):
             return H
         return symmetric_rank_one(H, there.x - here.x, there.gradient - here.gradient)
 
-    def ended(self, here: Iterate[Assessment], there: Iterate[Assessment]) -> bool:
-        """Where another search has been."""
+    def has_ended(self, here: Iterate[Assessment], there: Iterate[Assessment]) -> bool:
+        """Decide whether another search has been there."""
         return self.is_known(there.x)
 
     def is_known(self, x: Array) -> bool:
@@ -210,7 +212,7 @@ def ascend(
     """
     model = LoopModel(problem)
     model.restoring = restoring
-    begin = model.assessed(start.kappa, start.tau, start.assessment)
+    begin = model.make_iterate(start.kappa, start.tau, start.assessment)
     assert begin is not None
     n = len(begin.x)
     end = minimise(
@@ -313,7 +315,7 @@ class Envelope:
         return self.direct + self.multipliers[: len(self.to_theta)] @ self.to_theta
 
     def times(self, scale: float) -> "Envelope":
-        """That of `scale` v."""
+        """Scale the envelope to that of `scale` v."""
         return replace(self, direct=scale * self.direct, to_theta=scale * self.to_theta)
 
 
@@ -345,7 +347,7 @@ class Optimality:
         mu = self.multipliers[len(self.kinds) :]
         return tuple((*end, float(value)) for end, value in zip(self.box_ends, mu, strict=False))
 
-    def named(self) -> dict[str, float]:
+    def by_kind(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
         found: dict[str, float] = {}
         for name, mu in zip(self.kinds, self.multipliers * self.shares, strict=False):
@@ -377,7 +379,7 @@ def optimality(
                 ends.append((name, word))
     if abs(point.tau - floor) <= options.active:
         rows.append(-unit[n:])
-    shares, closed = np.ones(sum(map(len, rows))), problem.closed(active, point.tau)
+    shares, closed = np.ones(sum(map(len, rows))), problem.closed_share(active, point.tau)
     # ∂ ln(shape x - (shape - 1)/x)/∂ ln shape
     shares[: len(closed)] -= problem.inverse_square(active, point.tau)
     shares[: len(closed)] /= 1.0 - closed
@@ -392,7 +394,8 @@ def envelope_of(
     problem: LoopProblem, kappa: Array, optimality: Optimality, direct: Array | None = None,
     options: OptimalityOptions = OptimalityOptions(),
 ) -> Envelope | None:  # fmt: skip
-    """That of ln ω_b*(θ), or of a value made small whose slope at a fixed κ is `direct` (n_θ,).
+    """Compute the envelope of ln ω_b*(θ), or of a value made small whose slope at a fixed κ is
+    `direct` (n_θ,).
 
     None where the conditions of optimality do not hold.
     """

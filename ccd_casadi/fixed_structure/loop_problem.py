@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, BrokenAt, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.plant_set import PlantSet, padded
+from ccd_casadi.fixed_structure.plant_set import PlantSet, pad
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
@@ -61,7 +61,7 @@ class LoopProblem:
 
     @cached_property
     def low(self) -> float:
-        """ω_low over ω₀."""
+        """The lowest frequency ω_low over ω₀."""
         return self.bounds.omega_low / self.plants.omega_0
 
     @cached_property
@@ -84,8 +84,8 @@ class LoopProblem:
     def fixed(self) -> Array:
         """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
         roots = [np.append(np.linalg.eigvals(G.A), G.zeros()) for G in self.plants.systems]
-        found = padded([own[own.imag >= 0.0] for own in roots], np.nan, complex)
-        return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
+        found = pad([own[own.imag >= 0.0] for own in roots], np.nan, complex)
+        return np.concatenate([np.tile(self.base, (len(found), 1)), add_flanks(found)], axis=1)
 
     @cached_property
     def answers(self) -> tuple[np.ndarray, np.ndarray]:
@@ -99,12 +99,12 @@ class LoopProblem:
         return held, bare
 
     def __getstate__(self) -> dict[str, object]:
-        """Without what another process computes as fast as it reads it."""
+        """Drop what another process computes as fast as it reads it."""
         return {key: value for key, value in vars(self).items() if key != "answers"}
 
     @cached_property
     def curves(self) -> tuple[LoopCurve, ...]:
-        """Those of which all peaks count."""
+        """The curves of which all peaks count."""
         found = [LoopCurve.S_MAX, LoopCurve.LEVEL]
         if self.bounds.shape is not None:
             found.append(LoopCurve.SHAPE)
@@ -116,18 +116,19 @@ class LoopProblem:
 
     @cached_property
     def short(self) -> np.ndarray:
-        """Which of the curves are bounded on ω <= ω_b only."""
+        """Whether each of the curves is bounded on ω <= ω_b only."""
         ends = self.bounds.shape_ends is ShapeEnd.CROSSING
         return np.isin(self.curves, [LoopCurve.LEVEL, *[LoopCurve.SHAPE] * ends])
 
     @cached_property
     def late(self) -> np.ndarray:
-        """Which of the curves are bounded on ω >= ω_b only."""
+        """Whether each of the curves is bounded on ω >= ω_b only."""
         return np.isin(self.curves, [LoopCurve.SHAPE] * self.bounds.opens)
 
     @property
     def first(self) -> int:
-        """How many gains of each matrix are of the whole; the others are rows of channels."""
+        """The number of gains of each matrix that are of the whole; the others are rows of
+        channels."""
         return int(self.plants.residues.shape[2])
 
     @cached_property
@@ -171,7 +172,8 @@ class LoopProblem:
 
     @cached_property
     def limits(self) -> Array:
-        """What gains are held against but for ω_b, (Limit.COUNT, numbers); see `sections.Limit`."""
+        """The limits of the gains without those that depend on ω_b, (Limit.COUNT, numbers); see
+        `sections.Limit`."""
         b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
         found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
         found[: len(LoopCurve)] = np.inf
@@ -234,7 +236,8 @@ class LoopProblem:
         return constraints.plant % self.plants.count
 
     def gains_of(self, constraints: "Constraints") -> np.ndarray:
-        """Of which part of the problem each row is, and which gain of a plant's matrix, (M, 2)."""
+        """Return the part of the problem that each row is of, and which gain of a plant's matrix,
+        (M, 2)."""
         number = constraints.plant // self.plants.count
         return np.column_stack([np.zeros_like(number), number])
 
@@ -249,7 +252,7 @@ class LoopProblem:
         own = self.bounds.opens & (at.curve == LoopCurve.SHAPE)
         return np.where(own, 1.0 / np.maximum(x, 1.0) ** 2, 0.0)
 
-    def closed(self, at: "RowPlaces", tau: float) -> Array:
+    def closed_share(self, at: "RowPlaces", tau: float) -> Array:
         """The share of shape ω/ω_i that is not open yet at rows (M,)."""
         return (1.0 - 1.0 / (self.bounds.shape or 1.0)) * self.inverse_square(at, tau)
 
@@ -257,11 +260,11 @@ class LoopProblem:
         """∂c/∂τ of rows at a fixed frequency (M,)."""
         opens, shape = self.bounds.opens, at.curve == LoopCurve.SHAPE
         found = np.where(shape | (opens & (at.curve == LoopCurve.LEVEL)), 1.0, 0.0)
-        closed = self.closed(at, tau)
+        closed = self.closed_share(at, tau)
         return np.asarray(found + 2.0 * closed / (1.0 - closed))
 
     def loop(self, kappa: Array, tau: float) -> LoopArrays:
-        """What the kernels take at κ and τ."""
+        """Return the arrays that the kernels take at κ and τ."""
         limits = self.limits.copy()
         limits[Limit.BANDWIDTH] = np.exp(tau + self.leads)
         plants = self.plants
@@ -358,6 +361,6 @@ class Assessment:
         return max(0.0, float(self.peaks.value.max()))
 
 
-def flanked(values: np.ndarray) -> Array:
+def add_flanks(values: np.ndarray) -> Array:
     """Frequencies around roots (P, n): the imaginary part with flanks, and the size."""
     return np.concatenate([root_flanks(values), np.abs(values)], axis=1)

@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem, Prob
 from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.terminal import Log
 from ccd_casadi.support.text import number
 from ccd_casadi.support.time_budget import ends_early
 
@@ -34,7 +34,7 @@ class ReinsertionOptions:
     step: float = 0.3  # ln: how far a pole may move; a light one no further than its half width
 
 
-def reinserted(
+def reinsert(
     problem: Problem, ends: Sequence[Point], options: ReinsertionOptions = ReinsertionOptions()
 ) -> Array:
     """(N, n) controllers like those at the ends, each with one section that cancels."""
@@ -140,14 +140,14 @@ class SearchRun(Ascent):
 
     @property
     def merit(self) -> float:
-        """That of its point."""
+        """The merit of its point."""
         return self.point.merit()
 
 
 def search_from_starts(
     problem: LoopProblem,
     pool: Array,
-    tell: Tell,
+    log: Log,
     workers: Pool | None = None,
     before: Sequence[SearchRun] = (),
     known: int = 0,
@@ -161,7 +161,7 @@ def search_from_starts(
     problem : LoopProblem
     pool : array (N, n)
         Starts; the first `known` are controllers that searches have ended with.
-    tell : callable
+    log : callable
         Of words, the progress.
     workers : Pool or None
     before : sequence of SearchRun
@@ -179,7 +179,7 @@ def search_from_starts(
     """
     field = list(before)
     field += [SearchRun(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
-    field += [SearchRun(started(problem, kappa)) for kappa in pool[known:]]
+    field += [SearchRun(start_at(problem, kappa)) for kappa in pool[known:]]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
     for turn in range(options.rounds):
         running = [runner for runner in field if runner.running]
@@ -189,8 +189,8 @@ def search_from_starts(
         if turn > 0 and ends_early("controller search round"):
             break
         others = [runner for runner in field if not runner.running]
-        field = others + _climbed(problem, running, workers, options)
-        field = _merged(sorted(field, key=lambda runner: -runner.merit))
+        field = others + _climb_all(problem, running, workers, options)
+        field = _merge(sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn, options)
         lead, going = field[0].point, sum(runner.running for runner in field)
         over = lead.assessment.violation
@@ -198,11 +198,11 @@ def search_from_starts(
         kept = exceeded if over > options.violation else "within every bound"
         best = f"{number(float(np.exp(lead.tau)) * scale, 4)} Hz, {kept}"
         count = f"round {turn + 1} of {options.rounds}"
-        tell(f"{best}; {going} of {len(running)} searches continue, {count}")
+        log(f"{best}; {going} of {len(running)} searches continue, {count}")
     return field
 
 
-def started(
+def start_at(
     problem: LoopProblem, kappa: Array, *, within: float = MultiStartOptions.violation
 ) -> Point:
     """A controller at the bandwidth that searches start from; lower if it keeps its bounds there.
@@ -271,7 +271,7 @@ def at_its_bandwidth(
 def arrivals(
     runners: Sequence[SearchRun], best: SearchRun, options: MultiStartOptions = MultiStartOptions()
 ) -> int:
-    """How many searches reached the bandwidth of the best one, within its bounds."""
+    """Count the searches that reached the bandwidth of the best one, within its bounds."""
     return sum(
         runner.count for runner in runners
         if abs(runner.point.tau - best.point.tau) <= options.same
@@ -279,7 +279,7 @@ def arrivals(
     )  # fmt: skip
 
 
-def finished(
+def finish(
     runners: Sequence[SearchRun], options: MultiStartOptions = MultiStartOptions()
 ) -> list[SearchRun]:
     """Select the searches whose steps help no longer, and the best.
@@ -303,7 +303,7 @@ def distinct(
 ) -> list[Point]:
     """The best `count` ends of unequal bandwidth, those outside the bounds last."""
     found: list[SearchRun] = []
-    for runner in finished(runners, options):
+    for runner in finish(runners, options):
         if all(abs(runner.point.tau - other.point.tau) > options.same for other in found):
             found.append(runner)
     return [runner.point for runner in found[:count]]
@@ -328,7 +328,7 @@ def local_optima(
     return tuple(found)
 
 
-def _climbed(
+def _climb_all(
     problem: LoopProblem, running: Sequence[SearchRun], workers: Pool | None,
     options: MultiStartOptions,
 ) -> list[SearchRun]:  # fmt: skip
@@ -358,7 +358,7 @@ def _climb(
     return replace(end, evaluations=before.evaluations + end.evaluations), gained
 
 
-def _merged(field: Sequence[SearchRun]) -> list[SearchRun]:
+def _merge(field: Sequence[SearchRun]) -> list[SearchRun]:
     """The field, best first, without searches that are where a better one is."""
     kept: list[SearchRun] = []
     merged = LocalSearchOptions.merged

@@ -34,9 +34,9 @@ from ccd_casadi.fixed_structure.channel_structure import (
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.modes import PlantSlopes
-from ccd_casadi.lti.loop import Sampling, delay_parts, delayed, in_w, moment_slopes, moments
+from ccd_casadi.lti.loop import Sampling, delay_parts, in_w, moment_slopes, moments, with_delays
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
-from ccd_casadi.plants.rigid_modes import driven_and_measured, placed
+from ccd_casadi.plants.rigid_modes import driven_and_measured, embed
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -79,11 +79,11 @@ class LoopPlant:
 
     @property
     def free_bodies(self) -> np.ndarray:
-        """Of 1/s², (p, m)."""
+        """The matrices of 1/s² of the free bodies, (p, m)."""
         return self.system.C @ self.nilpotent @ self.system.B
 
     def in_w(self, period: float | None, delay: float) -> StateSpace:
-        """With hold and delay, as a rational function of w; itself where nothing is sampled.
+        """Include hold and delay as a rational function of w; itself where nothing is sampled.
 
         x_{k+1} = V e^{pT} W x_k + V late W B u_{k-d} + V early W B u_{k-d-1}
                   + N (T x_k + h²/2 B u_{k-d} + (T² - h²)/2 B u_{k-d-1})
@@ -97,7 +97,7 @@ class LoopPlant:
                  for share, moved in zip(shares, coasted, strict=True)]  # fmt: skip
         gains = [np.zeros_like(self.system.B)] * int(d) + gains[: 1 + bool(np.any(shares[1]))]
         step = ((self.V * np.exp(self.poles * period)) @ self.W).real + N * period
-        return in_w(delayed(step, gains, self.system.C, period))
+        return in_w(with_delays(step, gains, self.system.C, period))
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class PlantSet:
     @cached_property
     def states(self) -> tuple[Array, Array, Array, Array]:
         """A (P, n, n), B, C and D of these; the shorter ones with stable states that do nothing."""
-        A, B, C, D = (padded([getattr(G, name) for G in self.systems]) for name in "ABCD")
+        A, B, C, D = (pad([getattr(G, name) for G in self.systems]) for name in "ABCD")
         for whole, G in zip(A, self.systems, strict=True):
             rest = np.arange(len(G.A), len(whole))
             whole[rest, rest] = -1.0
@@ -191,7 +191,7 @@ class PlantSet:
         return np.asarray(2.0 / self.period * np.arctan(0.5 * self.period * v))
 
     def chain(self, v: Array) -> Array:
-        """∂ln ω/∂ln v."""
+        """Compute ∂ln ω/∂ln v."""
         T = self.period or 0.0
         return np.asarray(v / self.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
 
@@ -211,8 +211,8 @@ class PlantSet:
 
     @cached_property
     def slopes(self) -> PlantSlopes:
-        """What the kernels need for derivatives to θ; the shorter plants with zeros."""
-        C, B, *parts = (padded([getattr(plant, name) for plant in self.plants], dtype=complex)
+        """The data of the kernels for derivatives to θ; the shorter plants with zeros."""
+        C, B, *parts = (pad([getattr(plant, name) for plant in self.plants], dtype=complex)
                         for name in ("reading", "drive", "dA", "dB", "dC"))  # fmt: skip
         poles, kinds = self.poles, np.full(self.poles.shape, modes.SIMPLE, np.int8)
         if any(plant.wired_bodies for plant in self.plants):
@@ -341,8 +341,8 @@ def _set_of(
     period = None if sampling is None else sampling.period * omega_0
     delay = 0.0 if sampling is None else sampling.delay * omega_0
     found = tuple(_loop_plant(plant, f"plant {i}", alike) for i, plant in enumerate(scaled, 1))
-    poles = padded([one.poles for one in found], -1.0, complex)
-    residues = padded([np.einsum("pn,nm->npm", one.reading, one.drive) for one in found],
+    poles = pad([one.poles for one in found], -1.0, complex)
+    residues = pad([np.einsum("pn,nm->npm", one.reading, one.drive) for one in found],
                       dtype=complex)  # fmt: skip
     for own, one in zip(residues, found, strict=True):
         if len(one.chains):
@@ -350,7 +350,7 @@ def _set_of(
     return PlantSet(found, omega_0, force, period, delay, poles, residues, *directions)
 
 
-def padded(parts: Sequence[np.ndarray], fill: float = 0.0, dtype: type = float) -> np.ndarray:
+def pad(parts: Sequence[np.ndarray], fill: float = 0.0, dtype: type = float) -> np.ndarray:
     """Arrays of one rank as one, the smaller ones filled up at their ends."""
     sizes = np.max([part.shape for part in parts], axis=0)
     out = np.full((len(parts), *sizes), fill, dtype)
@@ -437,7 +437,7 @@ def _with_bodies_seen(plant: ScaledPlant) -> tuple[ScaledPlant, np.ndarray]:
         return plant, chains
     kept = np.setdiff1d(np.arange(len(plant.A)), chains[count:])
     own, both = np.concatenate([q, v]), np.eye(2)
-    into, out = (placed(np.asarray(np.kron(both, M)), own, kept) for M in (T, back.T))
+    into, out = (embed(np.asarray(np.kron(both, M)), own, kept) for M in (T, back.T))
     out = out.T
     A, left = out @ plant.A @ into, np.searchsorted(kept, chains[:count])
     A[left.ravel()] = A[:, left.ravel()] = 0.0  # but for rounding, as these states are free

@@ -153,7 +153,7 @@ def redraw_section(
 
 
 def stabilising(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
-    """Those (N, n) with which every closed loop is stable."""
+    """Select the κ (N, n) with which every closed loop is stable."""
     parts = [kappa[i : i + chunk] for i in range(0, len(kappa), chunk)]
     good = [
         all_stable(closed_loops(problem.plants, problem.structure, part)).all(1) for part in parts
@@ -229,7 +229,7 @@ def actuator_starts(
     draws_for_each: int = 40,
     stiffness_line: float = -1.0,
 ) -> list[Array]:
-    """Up to `count` controllers κ of the whole that are stable on all plants, in their units.
+    """Find up to `count` controllers κ of the whole that are stable on all plants, in their units.
 
     Crossovers are drawn over ω₀, `draws_for_each` of those required; where d ln|G|/d ln ω is above
     `stiffness_line` the stiffness holds what is moved.

@@ -73,7 +73,7 @@ class Structure:
             raise ValueError(f"slowest_zero_hz is {self.slowest_zero_hz}; give Hz, or 0 for none")
 
     def identity(self) -> dict[str, object]:
-        """Its values; of what came later only what is not the default."""
+        """Return its values; those that came later only where they are not the default."""
         later = {"slowest_zero_hz": 0.0}
         return {key: value for key, value in vars(self).items() if value != later.get(key)}
 
@@ -159,12 +159,12 @@ class Structure:
 
     @property
     def structures(self) -> "tuple[Structure, ...]":
-        """Those of its channels: itself."""
+        """The structures of its channels: itself."""
         return (self,)
 
     @property
     def slices(self) -> tuple[slice, ...]:
-        """Where each channel's parameters are in κ."""
+        """The slice of κ with each channel's parameters."""
         return (slice(0, len(self.names)),)
 
     @property

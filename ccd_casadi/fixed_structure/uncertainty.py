@@ -153,7 +153,7 @@ class UncertainPlant:
             return scale_at_ports(modal, self.M_K, self.own)
         return scale_plant(modal, self.M_K, bare=True)
 
-    def sloped(self, point: Array, option: int = 0) -> ScaledPlant:
+    def with_slopes(self, point: Array, option: int = 0) -> ScaledPlant:
         """The same with derivatives to the point itself, one for each of `names`.
 
             ∂k_i = 2 k_i ∂r_i/r_i,   ∂d_i = d_i ∂r_i/r_i,   r_i = (1 + p_common)(1 + p_i)
@@ -222,7 +222,7 @@ class UncertainPlant:
         modal = modal_plant(system, self._free, off)
         modal = without_hidden_rigid_modes(modal)
         gain = 1.0 + values.get("gain", 0.0)
-        return modal if gain == 1.0 else modal.driven(gain)
+        return modal if gain == 1.0 else modal.scale_input(gain)
 
     def plants(self, points: Sequence[tuple[int, Array]]) -> list[ScaledPlant]:
         """The plants of (option, point) pairs."""

@@ -142,7 +142,7 @@ class LoopOnBox:
         found = dict(results(workers, _largest, parts))
         return np.concatenate([found[i] for i in parts])
 
-    def assessed(self, plants: Sequence[ScaledPlant]) -> Loops:
+    def assess(self, plants: Sequence[ScaledPlant]) -> Loops:
         """The loops with these plants."""
         problem = problem_for(plants, self.structure, self.bounds, self.sampling)
         kappa, units = in_problem_units(problem, self.kappa), problem.plants
@@ -159,7 +159,7 @@ class LoopOnBox:
 
 
 def _largest(loop: LoopOnBox, points: Sequence[tuple[int, Array]]) -> Array:
-    return loop.assessed(loop.uncertain.plants(points)).largest
+    return loop.assess(loop.uncertain.plants(points)).largest
 
 
 def meetings(
@@ -218,13 +218,13 @@ class Peak:
         return int(rows[np.argmax(loops.value[rows])]) if len(rows) else None
 
 
-def climbed(
+def climb(
     loop: LoopOnBox, points: Sequence[tuple[int, Array]],
     options: WorstPlantOptions = WorstPlantOptions(),
 ) -> tuple[list[Excess], int]:  # fmt: skip
     """The worst plants found from these points (option, point) on, the worst first, and how many
     were assessed; of those within every bound the worst alone."""
-    loops = loop.assessed(loop.uncertain.plants(points))
+    loops = loop.assess(loop.uncertain.plants(points))
     peaks, examined = _distinct(points, loops, options), len(points)
     ends: list[Peak] = []
     for _ in range(options.climbs):
@@ -232,7 +232,7 @@ def climbed(
         if not steps:
             break
         examined += len(steps)
-        moved = _moved(loop, peaks, steps, options.near)
+        moved = _move_peaks(loop, peaks, steps, options.near)
         rising = [after.value > before.value + options.least_gain
                   and after.value < loop.unstable
                   for before, after in zip(peaks, moved, strict=True)]  # fmt: skip
@@ -251,7 +251,7 @@ def _apart(loop: LoopOnBox, peaks: Sequence[Peak], options: WorstPlantOptions) -
     before it."""
     if not peaks:
         return []
-    loops = loop.assessed(loop.uncertain.plants([(peak.option, peak.point) for peak in peaks]))
+    loops = loop.assess(loop.uncertain.plants([(peak.option, peak.point) for peak in peaks]))
     found: list[int] = []
     for i, peak in enumerate(peaks):
         alike = [j for j in found if peaks[j].option == peak.option]
@@ -290,7 +290,7 @@ def _towards_corners(
     if not peaks:
         return []
     box = loop.uncertain.box
-    loops = loop.assessed([loop.uncertain.sloped(peak.point, peak.option) for peak in peaks])
+    loops = loop.assess([loop.uncertain.with_slopes(peak.point, peak.option) for peak in peaks])
     found = (peak.row_of(loops, i, options.near) for i, peak in enumerate(peaks))
     rows = {i: row for i, row in enumerate(found) if row is not None}
     if not rows:
@@ -304,11 +304,11 @@ def _towards_corners(
     return steps
 
 
-def _moved(
+def _move_peaks(
     loop: LoopOnBox, peaks: Sequence[Peak], steps: Sequence[tuple[int, Array]], near: float
 ) -> list[Peak]:
     """Every peak where it is highest: where it was, or after one of the steps from there."""
-    loops = loop.assessed(loop.uncertain.plants([(peaks[i].option, point) for i, point in steps]))
+    loops = loop.assess(loop.uncertain.plants([(peaks[i].option, point) for i, point in steps]))
     out = list(peaks)
     for number, (i, point) in enumerate(steps):
         largest, row = float(loops.largest[number]), peaks[i].row_of(loops, number, near)
@@ -402,7 +402,7 @@ def worst_plants(
     if n > options.few:
         points = lattice(uncertain, min(count, options.lattice_of_many), seed, along=along)
         points = _sharp(uncertain, points, options.damped_every)
-        return climbed(loop, [*points, *meetings(uncertain)], options)
+        return climb(loop, [*points, *meetings(uncertain)], options)
     points = lattice(uncertain, count, seed, along=along)
     value = loop.excesses(points, workers)
     examined, first = len(points), np.argsort(-value)[: options.searches]

@@ -41,10 +41,11 @@ class FigureOfMerit:
     entry: str
 
     def gain(self, other: float, than: float) -> float:
-        """By how much (relative) a value is better than another; negative where it is worse."""
+        """Compute by how much (relative) a value is better than another; negative where it is
+        worse."""
         return (other / than if self.larger_is_better else than / other) - 1.0
 
-    def shown(self, value: float, digits: int = 4) -> str:
+    def format_value(self, value: float, digits: int = 4) -> str:
         """The value with its unit, a length or a time with the prefix that its size needs.
 
         >>> RMS_ERROR.shown(12.3456e-9)
@@ -68,7 +69,7 @@ Options = tuple[tuple[str, object], ...]
 
 @dataclass(frozen=True)
 class ControllerProblem:
-    """What a problem states of its controller; the base of all kinds.
+    """The statement of the controller in a problem; the base of all kinds.
 
     By default a continuous controller of largest bandwidth, on the plant of the case alone.
 
@@ -87,7 +88,7 @@ class ControllerProblem:
 
     @property
     def figure(self) -> FigureOfMerit:
-        """What J counts of the controller."""
+        """The figure of the controller that J counts."""
         return BANDWIDTH
 
     @property
@@ -109,7 +110,7 @@ class ControllerProblem:
         """Raise PlantError unless such a controller can be designed for each of the plants."""
 
     def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
-        """What else determines a design, given the weights and the budget of its problem."""
+        """Return what else determines a design, given the weights and the budget of its problem."""
         return {}
 
 
@@ -160,7 +161,7 @@ class RobustSet:
             return "auto"
         return ("low", "nominal", "high")[1 + int(np.sign(self.design_shift))]
 
-    def scaled(self, share: float) -> "RobustSet":
+    def scale(self, share: float) -> "RobustSet":
         """The set that reaches a share of this one's way, from the model alone (0) to it (1)."""
         design = None if self.design_shift is None else share * self.design_shift
         damping = tuple(factor**share for factor in self.damping)

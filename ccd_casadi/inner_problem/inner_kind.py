@@ -38,7 +38,7 @@ class InnerKind(ABC):
         """v(θ) in SI and its gradient (n,); NaN where no controller is certified."""
 
     @abstractmethod
-    def described(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         """The kind of controller, and how it runs or is searched, for the eye."""
 
     @abstractmethod
@@ -50,7 +50,7 @@ class InnerKind(ABC):
         return [scaled_plant(self.problem, theta)]
 
     def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        """Those that margins and steps are of: with the plants of a robust set."""
+        """Return the plants that margins and steps are of: those of a robust set too."""
         return self.plants(theta)
 
     def bounds(self) -> Bounds:
@@ -67,5 +67,5 @@ class InnerKind(ABC):
         return (1.0,), (1.0,)
 
     @abstractmethod
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
-        """What S, KS and T of a design may not exceed, over frequency."""
+    def gain_bounds(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+        """Return what S, KS and T of a design may not exceed, over frequency."""

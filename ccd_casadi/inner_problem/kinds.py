@@ -55,14 +55,14 @@ class MixedSensitivity(InnerKind):
         bounded = tuple(self.problem.inner.bounds)
         return found.bandwidth, bandwidth_gradient(found.optimum, found.active, bounded)
 
-    def described(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         inner = self.problem.inner
         ranges = (("ω_S", inner.omega_S), ("ω_T", inner.omega_T))
         words = (f"{name} {a / HZ:.5g} to {b / HZ:.5g} Hz" for name, (a, b) in ranges)
         return "mixed sensitivity", ", ".join(words)
 
     def require_function(self) -> None:
-        """It is a function of θ for every problem."""
+        """Accept every problem: the value is a function of θ."""
 
     def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
         return list(scaled_plant(self.problem, theta).members)
@@ -75,7 +75,7 @@ class MixedSensitivity(InnerKind):
         robust = self.problem.robust
         return (1.0,) if robust is None else robust.damping, (1.0,)
 
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+    def gain_bounds(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         """S, KS and T stay below γ/|W|."""
 
         def over(hz: Array) -> Array:
@@ -103,7 +103,8 @@ def kind_of(problem: CoDesignProblem) -> InnerKind:
 
 
 def _fixed_structure(problem: CoDesignProblem) -> InnerKind:
-    """Its search is imported where a problem has such a controller."""
+    """Make the kind of a fixed structure; its search is imported where a problem has such a
+    controller."""
     from ccd_casadi.inner_problem.structured_kind import FixedStructure
 
     return FixedStructure(problem)
@@ -247,7 +248,7 @@ def design_view(
     -------
     LoopView
     """
-    bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
+    bounded = kind_of(problem).gain_bounds(weights or problem.weights, gamma, bandwidth_hz)
     loops = member_loops(problem, theta, controller)  # whose figures the result has
     return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
 

@@ -102,7 +102,7 @@ def constraint_shares(problem: CoDesignProblem, theta: Array | tuple[float, ...]
     return constraint_values(plant_of(problem), theta) / constraint_sizes(problem)
 
 
-def violated(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
+def violations(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
     """Name the constraints that θ exceeds by more than rounding.
 
     Parameters
@@ -193,7 +193,7 @@ def objective_of(problem: CoDesignProblem, sample: InnerValue) -> float:
     float
         Infinite where no design is certified or λ(θ) <= 0 is not met.
     """
-    if not sample.feasible or violated(problem, sample.theta):
+    if not sample.feasible or violations(problem, sample.theta):
         return np.inf
     return objective(problem, sample.theta, sample.value)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
-from ccd_casadi.plants.model_function import ModelFunction, widened
+from ccd_casadi.plants.model_function import ModelFunction, widen
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
@@ -54,7 +54,7 @@ def files_of(path: Path, words: Iterable[str] = ()) -> tuple[Path, ...]:
             if isinstance(node, ast.Constant) and isinstance(node.value, str)
         ]  # fmt: skip
         named += _beside(strings, (module.parent, Path.cwd()))
-        for other in _imported(tree, module, first.parent):
+        for other in _find_imported(tree, module, first.parent):
             if other not in found:
                 found[other] = None
                 waiting.append(other)
@@ -80,7 +80,7 @@ def loaded_from(files: Iterable[Path]) -> list[str]:
     return [name for name, place in _own_modules() if place in known] if known else []
 
 
-def unseen(files: Iterable[Path], before: Iterable[str]) -> list[Path]:
+def find_unseen(files: Iterable[Path], before: Iterable[str]) -> list[Path]:
     """Modules in the folder of the first file that were loaded since, and are not among these."""
     known, old = list(files), set(before)
     return [
@@ -104,7 +104,7 @@ def _own(place: Path) -> bool:
     return not (place.is_relative_to(STANDARD) or place.is_relative_to(OURS))
 
 
-def _imported(tree: ast.AST, module: Path, folder: Path) -> Iterator[Path]:
+def _find_imported(tree: ast.AST, module: Path, folder: Path) -> Iterator[Path]:
     """Files of the user's modules that a text imports anywhere in it."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -203,7 +203,7 @@ class PlantSource:
 
     @property
     def name(self) -> str:
-        """Of the model, or of the function and its file."""
+        """The name of the model, or of the function and its file."""
         return self.model or ":".join(filter(None, (self.file, self.function)))
 
     @property
@@ -211,7 +211,7 @@ class PlantSource:
         """The fixed parameters' values."""
         return {name: value for name, value, _ in self.fixed}
 
-    def pinned(self) -> "PlantSource":
+    def pin(self) -> "PlantSource":
         """The same, with the hash of its files' content: a process must not keep an older one."""
         if self.file is None or self.content is not None:
             return self
@@ -222,14 +222,14 @@ class PlantSource:
         return replace(self, content=content)
 
     def files(self) -> tuple[Path, ...]:
-        """Its file, and those that this depends on (`plant_files`)."""
+        """List its file, and those that this depends on (`plant_files`)."""
         assert self.file is not None
         words = [value for _, value in self.options if isinstance(value, str)]
         return files_of(Path(self.file), words)
 
     def identity(self) -> dict[str, object]:
-        """What determines the plant; a file counts by its content, not by where it lies."""
-        digest = self.pinned().content
+        """Return what determines the plant; a file counts by its content, not by its place."""
+        digest = self.pin().content
         options = dict(self.options)
         model = model_named(self.model)
         if data := model.data if model else "":
@@ -267,12 +267,12 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
         require_user_code(source.name)
     elif source.motion is None and source.places is None and not source.wiring:
         lower = upper = ()  # a shipped model is the same in any box
-    return _built(source.pinned(), names, lower, upper)
+    return _built(source.pin(), names, lower, upper)
 
 
 @lru_cache(maxsize=24)
 def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
-    """By its move, its places or its fixed parameters from the plant below."""
+    """Build the plant by its move, its places or its fixed parameters from the plant below."""
     if source.motion is not None:
         motion = source.motion
         size = () if motion.motor is None else (motion.motor.size,)
@@ -293,12 +293,12 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         return with_wiring(plant, wiring)
     held = source.held
     if source.places is not None:
-        from ccd_casadi.plants.places import placed
+        from ccd_casadi.plants.places import place_ports
 
         places = source.places
         held = {name: value for name, value in held.items() if name in places.names}
         plant = _below(replace(source, places=None), places.names, names, lower, upper)
-        plant = placed(plant, places, (*names, *held))
+        plant = place_ports(plant, places, (*names, *held))
     elif source.model is not None:
         model = model_named(source.model)
         assert model is not None
@@ -308,7 +308,7 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         from ccd_casadi.plants.differenced import user_plant
         from ccd_casadi.plants.fixed_parameters import fixed_model
 
-        function = fixed_model(widened(function) if source.wide else function, held)
+        function = fixed_model(widen(function) if source.wide else function, held)
         plant = user_plant(function, names, dict(source.options), lower, upper)
         if not plant.ports:
             return plant
@@ -380,7 +380,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
         raise UserError(f"{path}: cannot be loaded: {raised_words(error)}") from error
     finally:
         sys.dont_write_bytecode = kept
-    if lost := unseen(files, before):
+    if lost := find_unseen(files, before):
         words = f"loads {lost[0].name} by a way that its text does not show, so that a change of it"
         raise UserError(f"{path}: {words} would go unseen; write a plain import of it")
     if not callable(function):

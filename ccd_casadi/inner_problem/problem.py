@@ -108,7 +108,7 @@ class CoDesignProblem(NotebookHtml):
     spoken: tuple[str, str] = ("m", "N")
 
     def identity(self) -> dict[str, object]:
-        """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
+        """Return what determines one synthesis at (θ, ω_S, ω_T), and nothing more.
 
         S_max, S_low, bounds and the objective are not in it: the samples answer any of them. A
         bound on the compliance is only in so far as that is computed.
@@ -145,7 +145,7 @@ class CoDesignProblem(NotebookHtml):
 
     @property
     def figure(self) -> FigureOfMerit:
-        """What J counts of the controller."""
+        """The figure of the controller that J counts."""
         return self.controller.figure
 
     @property
@@ -160,7 +160,7 @@ class CoDesignProblem(NotebookHtml):
         return {**dict(zip(self.names, self.units, strict=True)), **fixed}
 
     def inner_identity(self) -> dict[str, object]:
-        """What else determines ω_b*(θ)."""
+        """Return what else determines ω_b*(θ)."""
         inner = self.inner
         return {
             **{name: bound for name, (_, bound) in inner.bounds.items()},

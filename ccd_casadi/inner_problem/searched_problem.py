@@ -18,7 +18,7 @@ Scenario = tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True)
 class WarmStartOptions:
-    """How many warm starts a state keeps."""
+    """Numbers of the warm starts that a state keeps."""
 
     found: int = 3  # of a multi-start search
     kept: int = 4  # with one that is added
@@ -26,7 +26,7 @@ class WarmStartOptions:
 
 @dataclass(frozen=True)
 class SearchState:
-    """What a search has found."""
+    """The state of a search: what it has found so far."""
 
     warm_starts: tuple[tuple[float, ...], ...] = ()  # κ (SI) of the largest bandwidth
     error_warm_starts: tuple[tuple[float, ...], ...] = ()  # of the least error or time
@@ -41,7 +41,8 @@ class SearchedProblem(CoDesignProblem):
     state: SearchState = field(default_factory=SearchState)
 
     def controller_identity(self) -> dict[str, Any]:
-        """That of the statement with the state, under the names that stores knew first."""
+        """Return the identity of the statement with the state, under the names that stores knew
+        first."""
         found, state = super().controller_identity(), self.state
         own = {"seed": state.seed, "anchors": state.warm_starts, "members": state.scenarios}
         if "least_error" in found["sections"]:

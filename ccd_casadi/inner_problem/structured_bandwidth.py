@@ -42,7 +42,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
 
@@ -225,12 +225,12 @@ class ProblemAt:
     def plants(self) -> list[ScaledPlant]:
         return plants_of(self.problem, self.theta)
 
-    def searched(
+    def search(
         self,
         initial: Sequence[Array],
         starts: int | None = None,
         most_starts: int = 0,
-        tell: Tell = silent,
+        log: Log = silent,
         workers: Pool | None = None,
     ) -> SectionsDesign:
         """The largest bandwidth, from controllers κ in SI and `starts` others beside them, or up to
@@ -240,12 +240,12 @@ class ProblemAt:
             self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
             starts=starts or 0, most_starts=most_starts, seed=state_of(self.problem).seed,
             initial=initial, only_initial=starts is None,
-            frequencies=structured.frequencies, progress=tell, workers=workers,
+            frequencies=structured.frequencies, progress=log, workers=workers,
         )  # fmt: skip
 
     @property
     def goal(self) -> Goal:
-        """What is made small besides -ω_b."""
+        """The figure that is made small besides -ω_b."""
         problem, sampling = self.problem, self.problem.sampling
         structure = structure_of(problem)
         assert isinstance(structure, Structure)
@@ -270,14 +270,14 @@ class ProblemAt:
             self.problem, structured_of(self.problem), structure_of(self.problem)
         )  # fmt: skip
         if problem.figure is BANDWIDTH or len(self.error_starts) < 2:
-            return self.searched(initial, workers=workers), None
+            return self.search(initial, workers=workers), None
         assert isinstance(structure, Structure)
         ends = first_descents(
             self.plants, structure, bounds_of(problem), self.goal, self.error_starts,
             sampling=structured.sampling, frequencies=structured.frequencies,
             least_bandwidth=structured.bandwidth_least,
         )  # fmt: skip
-        tasks = {-1: (partial(self.searched, initial),), **{i: (end,) for i, end in ends.items()}}
+        tasks = {-1: (partial(self.search, initial),), **{i: (end,) for i, end in ends.items()}}
         found = dict(results(workers, call, tasks))
         return found.pop(-1), {i: found[i] for i in ends}
 
@@ -285,7 +285,7 @@ class ProblemAt:
         self,
         design: SectionsDesign,
         only_initial: bool = False,
-        tell: Tell = silent,
+        log: Log = silent,
         workers: Pool | None = None,
         ended: Mapping[int, Ended] | None = None,
     ) -> LeastValue:
@@ -294,7 +294,7 @@ class ProblemAt:
         return least_value(
             self.plants, bounds_of(problem), design, self.goal, sampling=structured.sampling,
             least_bandwidth=structured.bandwidth_least, initial=self.error_starts,
-            only_initial=only_initial, tell=tell, workers=workers, ended=ended,
+            only_initial=only_initial, log=log, workers=workers, ended=ended,
         )  # fmt: skip
 
     def value_of(
@@ -351,21 +351,21 @@ def structured_value(
         made, ended = here.searched_beside(initial, workers)
         spent += 1
     elif initial:
-        made = here.searched(initial)
+        made = here.search(initial)
         spent += 1
     lost = problem.figure is not BANDWIDTH and not (made and made.certified)
     if lost and here.error_starts:
         # Controllers of least error meet every bound where those of most bandwidth may not.
-        made = here.searched(here.error_starts, workers=workers)
+        made = here.search(here.error_starts, workers=workers)
         spent += 1
     if made is None or (starts and not made.certified):
-        made = here.searched(initial, min(options.starts, starts), workers=workers)
+        made = here.search(initial, min(options.starts, starts), workers=workers)
         spent += 1
     limit = OptimalityOptions.residual
     while made.certified and made.kkt_residual > limit and spent < options.searches:
         if time_is_up():
             break
-        again = here.searched([made.kappa], workers=workers)
+        again = here.search([made.kappa], workers=workers)
         spent += 1
         kept = (1.0 - options.rounding) * made.bandwidth
         if not again.certified or again.bandwidth < kept:

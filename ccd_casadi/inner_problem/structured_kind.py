@@ -36,7 +36,7 @@ class FixedStructure(InnerKind):
         found = structured_value(self.problem, theta)
         return found.value, np.array(found.gradient)
 
-    def described(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         sampling = self.problem.sampling
         runs = "in continuous time" if sampling is None else f"at {sampling.rate_hz:.5g} Hz"
         return "of fixed structure", runs
@@ -61,7 +61,7 @@ class FixedStructure(InnerKind):
         u = structured_of(self.problem).uncertainty
         return u.damping, (1.0 - u.gain, 1.0, 1.0 + u.gain)
 
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+    def gain_bounds(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         """The shape, and weighted_level/|W| of KS (N/m) and T."""
         inner, structured = self.problem.inner, structured_of(self.problem)
         level, bounds = structured.weighted_level or np.nan, bounds_of(self.problem)

@@ -263,7 +263,7 @@ class Ranged:
 
     @cached_property
     def wider(self) -> list[Plant]:
-        """Those of every option, over θ and what varies."""
+        """The plants of every option, over θ and what varies."""
         return [plant_of(with_ranges(option)) for option in _options(self.problem)]
 
     def __getstate__(self) -> dict[str, object]:
@@ -431,5 +431,5 @@ def _first_mode(plant: ScaledPlant) -> float:
 
 
 def _size(plant: ScaledPlant, omega: float) -> float:
-    """‖G(jω)‖ in m/N."""
+    """Compute ‖G(jω)‖ in m/N."""
     return float(np.linalg.norm(plant.plant_si().response(np.array([omega]))[0], 2))

@@ -80,7 +80,7 @@ class ChannelProblem:
     bandwidth_ratio: float = 1.0
 
     def identity(self) -> dict[str, Any]:
-        """Its values; of what came later only those that are not the default."""
+        """Return its values; those that came later only where they are not the default."""
         later = {"like": None, "S_max": None, "M_K": None, "bandwidth_ratio": 1.0}
         found = {key: value for key, value in vars(self).items() if value != later.get(key, ...)}
         return found | {"structure": self.structure.identity()}
@@ -203,7 +203,8 @@ class StructuredProblem(ControllerProblem):
             raise PlantError(f"controller.bandwidth_of = {words}; name one of them")
 
     def identity_with(self, weights: Weights, budget: "ErrorBudget | None") -> dict[str, Any]:
-        """Its own, ω_T that bounds KS and T, and what moves the stage where that counts."""
+        """Return its own identity, ω_T that bounds KS and T, and what moves the stage where that
+        counts."""
         found: dict[str, Any] = {"sections": self.identity() | {"omega_T": weights.omega_T}}
         if self.figure is RMS_ERROR:
             assert budget is not None
@@ -211,7 +212,8 @@ class StructuredProblem(ControllerProblem):
         return found
 
     def identity(self) -> dict[str, Any]:
-        """What determines ω_b*(θ), as plain values; of no search state (`SearchedProblem`)."""
+        """Return what determines ω_b*(θ), as plain values, without a search state
+        (`SearchedProblem`)."""
         structure, sampling = self.structure, self.sampling
         found: dict[str, Any] = {
             "structure": structure.identity(),

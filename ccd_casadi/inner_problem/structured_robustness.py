@@ -40,7 +40,7 @@ from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers, results
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, of_a_bound
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class DesignOnBox:
         return uncertain_plant(self.problem, self.theta)
 
     def worst(
-        self, turn: int = 0, tell: Tell = silent, workers: Pool | None = None
+        self, turn: int = 0, log: Log = silent, workers: Pool | None = None
     ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of the box, and those to add: past a bound, each a new one.
 
@@ -115,7 +115,7 @@ class DesignOnBox:
         """
         problem, theta, design = self.problem, self.theta, self.design
         worst, found = violations(
-            problem, self.uncertain, design.kappa, design.bandwidth, turn, tell,
+            problem, self.uncertain, design.kappa, design.bandwidth, turn, log,
             options=self.options, workers=workers,
         )  # fmt: skip
         if problem.figure is MOVE_TIME and design.controller is not None:
@@ -123,13 +123,13 @@ class DesignOnBox:
             seed = state_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed, workers)
             late = f"{1e3 * time:.5g} ms" if np.isfinite(time) else "not settled"
-            tell(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
+            log(f"{late} on the latest plant, {1e3 * value:.5g} ms counted")
             if time > value:
                 found = (*found, (option, tuple(map(float, point))))
         return worst, found
 
     def worst_elsewhere(
-        self, turns: range, workers: Pool, tell: Tell
+        self, turns: range, workers: Pool, log: Log
     ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of several searches, and those to add of the first that finds any; as
         many at a time as there are workers, which share one that is left over."""
@@ -140,7 +140,7 @@ class DesignOnBox:
             found = dict(results(workers, self.worst, {turn: (turn, *inside) for turn in own}))
             seen += [worst for worst, _ in found.values()]
             largest = max(seen, key=lambda one: one.value)
-            tell(f"{of_a_bound(largest.value)} at most, searched from elsewhere")
+            log(f"{of_a_bound(largest.value)} at most, searched from elsewhere")
             added = next((found[turn][1] for turn in own if found[turn][1]), ())
             if added:
                 break
@@ -168,7 +168,7 @@ class DesignOnBox:
         assert K is not None
         require_as_returned(self.problem, self.theta)
         plants, loose = self.uncertain.as_written(points), self.options.looseness
-        return _judged(self.problem, plants, K, loose, workers), len(points)
+        return _judge(self.problem, plants, K, loose, workers), len(points)
 
     def counterexamples(
         self, wide: SetCertificate, proof: "Proof", worst: Excess, lost: Sequence[Scenario] = ()
@@ -208,16 +208,19 @@ class DesignOnBox:
         count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
         rng = np.random.default_rng((state.seed, options.fresh_seed + options.turn))
         points = uncertain.drawn(rng, count)
-        kept = self.kept(points, workers)
+        kept = self.find_kept(points, workers)
         lost = [(option, tuple(map(float, point))) for (option, point), good
                 in zip(points, kept, strict=True) if not good]  # fmt: skip
         return Yield(sum(kept), count, 1 + options.turn), tuple(lost)
 
-    def kept(self, points: Sequence[tuple[int, Array]], workers: Pool | None = None) -> list[bool]:
-        """Which plants (option, point) keep every bound and ω_b, by the judge, to `looseness`."""
+    def find_kept(
+        self, points: Sequence[tuple[int, Array]], workers: Pool | None = None
+    ) -> list[bool]:
+        """Decide which plants (option, point) keep every bound and ω_b, by the judge, to
+        `looseness`."""
         assert self.design.controller is not None
         plants, loose = self.uncertain.as_written(points), self.options.looseness
-        found = _judged(self.problem, plants, self.design.controller, loose, workers).plants
+        found = _judge(self.problem, plants, self.design.controller, loose, workers).plants
         bounds = bounds_of(self.problem).looser(loose)
         least = self.design.bandwidth * (1.0 - loose)
         return [
@@ -239,7 +242,7 @@ class DesignOnBox:
             problem.sampling, workers=workers, most_boxes=most_boxes,
         )  # fmt: skip
 
-    def judged(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":
+    def judge(self, worst: Excess, workers: Pool) -> "tuple[SetCertificate, int, Proof]":
         """On a lattice and by proof, one after the other, each spread over the workers; at one time
         by those of a cluster, unless there are several options."""
         if isinstance(workers, Workers) or structured_of(self.problem).uncertainty.options:
@@ -260,7 +263,7 @@ class DesignOnBox:
             return {}
         for option, point in state_of(problem).scenarios or uncertain.corners():
             further = (np.array(point) - uncertain.nominal)[:, None, None]
-            plants.append(uncertain.sloped(np.array(point), option).with_slopes_times(further))
+            plants.append(uncertain.with_slopes(np.array(point), option).with_slopes_times(further))
         found = bandwidth_envelope(plants, bounds_of(problem), self.design, problem.sampling)
         gradient = [] if found is None else found.gradient.tolist()
         return dict(zip(uncertain.names, gradient, strict=False))
@@ -272,7 +275,7 @@ def violations(
     kappa: Array,
     bandwidth: float,
     turn: int,
-    tell: Tell | None = None,
+    log: Log | None = None,
     within: float = WorstPlantOptions.within,
     others: Sequence[Scenario] = (),
     count: int = WorstPlantOptions.lattice,
@@ -288,7 +291,7 @@ def violations(
         κ in SI; ω_b in rad/s.
     turn, count : int
         Added to the problem's seed; plants of the lattice.
-    tell : callable, optional
+    log : callable, optional
         Is given a line.
     within : float
         ln of a bound, above which a plant violates it.
@@ -331,12 +334,12 @@ def violations(
         worse = fresh(heads)
         if worse:
             break
-    if tell is not None:
-        tell(f"{of_a_bound(heads[0].value)} at most on {examined} plants")
+    if log is not None:
+        log(f"{of_a_bound(heads[0].value)} at most on {examined} plants")
     return heads[0], worse
 
 
-def recertified(
+def recertify(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> SectionsDesign:
     """Judge a design again on the problem's plants, which may be newer than a stored design.
@@ -384,10 +387,10 @@ def certify_corners(
     """
     uncertain = uncertain_plant(problem, theta)
     plants = uncertain.as_written(points or uncertain.corners())
-    return _judged(problem, plants, controller, BoxCheckOptions.looseness)
+    return _judge(problem, plants, controller, BoxCheckOptions.looseness)
 
 
-def _judged(
+def _judge(
     problem: CoDesignProblem,
     plants: Sequence[StateSpace],
     controller: StateSpace,

@@ -27,7 +27,7 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant, with_
 from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.time_budget import ends_early, time_is_up
 
 
@@ -48,7 +48,7 @@ class StructuredSearchOptions:
 def search_starts(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    tell: Tell = silent,
+    log: Log = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
     options: StructuredSearchOptions = StructuredSearchOptions(),
@@ -62,7 +62,7 @@ def search_starts(
     Parameters
     ----------
     problem, theta : CoDesignProblem, sequence of float
-    tell, workers : callable, Pool, optional
+    log, workers : callable, Pool, optional
     only_warm_starts : bool
         Without other starts than the problem's warm starts.
     options : StructuredSearchOptions
@@ -74,11 +74,11 @@ def search_starts(
     here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in state_of(problem).warm_starts]
     starts = None if only_warm_starts else structured.starts
-    made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
+    made = here.search(warm_starts, starts, options.most_starts, log, workers)
     least = options.least_starts
     if made.certified or starts is None or starts >= least or ends_early("controller start", least):
         return made
-    return here.searched(warm_starts, least, options.most_starts, tell, workers)
+    return here.search(warm_starts, least, options.most_starts, log, workers)
 
 
 def with_range(
@@ -112,9 +112,9 @@ def with_range(
     return with_structured(problem, frequencies=(slowest, fastest))
 
 
-def prepared(
+def prepare_search(
     problem: CoDesignProblem,
-    tell: Tell = silent,
+    log: Log = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
     options: StructuredSearchOptions = StructuredSearchOptions(),
@@ -126,7 +126,7 @@ def prepared(
     Parameters
     ----------
     problem : CoDesignProblem
-    tell, workers : callable, Pool, optional
+    log, workers : callable, Pool, optional
     only_warm_starts : bool
         Searches start from the problem's warm starts alone.
     options : StructuredSearchOptions
@@ -147,19 +147,19 @@ def prepared(
     scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
     problem = with_state(problem, scenarios=scenarios)
 
-    made = search_starts(problem, problem.start, tell, workers, only_warm_starts, options)
+    made = search_starts(problem, problem.start, log, workers, only_warm_starts, options)
     worst: Excess | None = None
     last = True  # a search that ended off its optimum continues once no plant is found worse
     for turn in range(options.rounds if made.certified else 0):
         if ends_early("worst-plant check"):
             break
-        worst, wider = _wider(problem, problem.start, made, turn, tell, workers)
+        worst, wider = _wider(problem, problem.start, made, turn, log, workers)
         if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
         last = wider is None
         problem = with_state(wider or problem, warm_starts=_warm_starts(made, options))
         if not last:
-            made = search_starts(problem, problem.start, tell, workers, True, options)
+            made = search_starts(problem, problem.start, log, workers, True, options)
         if last or not made.certified:  # which has a few starts more where warm ones lead to none
             made = structured_value(problem, problem.start, workers).design
         worst = None
@@ -172,10 +172,10 @@ def prepared(
 
 def _wider(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, turn: int,
-    tell: Tell, workers: Pool | None = None,
+    log: Log, workers: Pool | None = None,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = DesignOnBox(problem, theta, design).worst(turn, tell, workers)
+    worst, found = DesignOnBox(problem, theta, design).worst(turn, log, workers)
     scenarios = (*state_of(problem).scenarios, *found)
     return worst, with_state(problem, scenarios=scenarios) if found else None
 
@@ -194,7 +194,7 @@ def _warm_starts(
 
 
 def least_from(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, tell: Tell = silent,
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, log: Log = silent,
     workers: Pool | None = None, options: StructuredSearchOptions = StructuredSearchOptions(),
 ) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:  # fmt: skip
     """Search the least of the problem's figure from a design of largest bandwidth.
@@ -202,7 +202,7 @@ def least_from(
     Parameters
     ----------
     problem, theta, design : CoDesignProblem, sequence of float, SectionsDesign
-    tell, workers : callable, Pool, optional
+    log, workers : callable, Pool, optional
     options : StructuredSearchOptions
 
     Returns
@@ -219,10 +219,10 @@ def least_from(
     wider = problem
     for turn in range(options.rounds_of_least):
         problem = wider
-        found = ProblemAt(problem, theta).least(design, tell=tell, workers=workers)
+        found = ProblemAt(problem, theta).least(design, log=log, workers=workers)
         if time_is_up():
             break
-        wider = _wider(problem, theta, found.design, turn, tell, workers)[1] or problem
+        wider = _wider(problem, theta, found.design, turn, log, workers)[1] or problem
         if wider is problem:
             break
     return with_warm_start(problem, found.design.kappa), found.design, found

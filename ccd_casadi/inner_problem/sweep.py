@@ -99,7 +99,7 @@ class InnerBounds:
 
     @property
     def synthesis_options(self) -> dict[str, Any]:
-        """How each synthesis is made and measured, as keyword arguments."""
+        """The options of each synthesis and its measurement, as keyword arguments."""
         return {
             "omega_low": self.omega_low,
             "gamma_backoff": self.gamma_backoff,
@@ -118,7 +118,8 @@ class InnerBounds:
         )
 
     def frequencies(self, x: Sequence[float] | Array) -> Point:
-        """From their logarithms, the last two of x; exp(log(bound)) may miss it by rounding."""
+        """Return the frequencies from their logarithms, the last two of x; exp(log(bound)) may miss
+        it by rounding."""
         S, T = np.clip(np.exp(x[-2]), *self.omega_S), np.clip(np.exp(x[-1]), *self.omega_T)
         return float(S), float(T)
 
@@ -331,7 +332,8 @@ def active_constraints(
 
 
 def shortfall(problem: InnerBounds, rows: Sequence[DesignFigures]) -> str:
-    """How near the certified designs came, and in which constraint, from every synthesis tried.
+    """Describe how near the certified designs came, and in which constraint, from every synthesis
+    tried.
 
     What was not found may exist all the same: these are the controllers of one synthesis with its
     weights' frequencies in a box, and no others.

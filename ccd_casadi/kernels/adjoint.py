@@ -24,7 +24,7 @@ class PlantGradients(NamedTuple):
 
 
 class MixedPullback:
-    """From [W1 S; W2 KS; W3 T] back to A, B, C and the weight vector (8,)."""
+    """The pull-back from [W1 S; W2 KS; W3 T] to A, B, C and the weight vector (8,)."""
 
     def __init__(self, A, B, C, w):
         self.n, self.m, self.p = A.shape[0], B.shape[1], C.shape[0]
@@ -91,7 +91,7 @@ class MixedPullback:
 
 
 class UnstablePullback(MixedPullback):
-    """From `unstable_plant` back to A, B, C and the weight vector (8,).
+    """The pull-back from `unstable_plant` to A, B, C and the weight vector (8,).
 
     To the weights the plant is that of the states [x; ξ]. dY is that of `FourBlockPullback`, and
     dV = (I - VVᵀ) dY V (VᵀYV)⁻¹, as V stays a basis of the range of Y and turns in no other way.
@@ -124,7 +124,7 @@ class UnstablePullback(MixedPullback):
 
 
 class FourBlockPullback(MixedPullback):
-    """From `innovations_plant` back to A, B, C and (weights, δ) (9,)."""
+    """The pull-back from `innovations_plant` to A, B, C and (weights, δ) (9,)."""
 
     def __init__(self, A, B, C, w, Y, delta):
         super().__init__(A, B, C, w)
@@ -139,12 +139,12 @@ class FourBlockPullback(MixedPullback):
         A_ = of.A[:, :n, :n] + 2.0 * L @ Y
         B_ = of.B2[:, :n] + 2.0 * delta**2 * L @ B
         C_ = self._of_e(of) - B1_.swapaxes(1, 2) @ Y - 2.0 * C @ Y @ L @ Y
-        C1_, C1_rate = self._turned_back(of.C1), self._turned_back(of.C1_rate)
+        C1_, C1_rate = self._turn_back(of.C1), self._turn_back(of.C1_rate)
         w_ = self._to_weights(of.A, of.A_rate, C1_, C1_rate)
         to_delta = 2.0 * delta * (B * (L @ B)).sum((1, 2))
         return A_, B_, C_, np.column_stack([w_, to_delta])
 
-    def _turned_back(self, C1_):
+    def _turn_back(self, C1_):
         """Rows to [z1; z2; z3] from the turned outputs."""
         m, p, d2, d3 = self.m, self.p, self.f[1, 3], self.f[2, 3]
         d, along, across = np.hypot(d2, d3), C1_[:, p : p + m], C1_[:, p + m :]
@@ -209,7 +209,8 @@ class BoundTerms(NamedTuple):
 
 
 def bound_terms(W1, W2, W3, sigma, delta):
-    """Of squared weights; monotone in σ, so that the largest and the least count."""
+    """Compute the terms of the bound from squared weights; monotone in σ, so that the largest and
+    the least count."""
     share = 1.0 if delta else sigma**2
     effort = W2 + share * W3
     size, total = 1.0 + (delta * sigma) ** 2, W1 * sigma**2 + effort

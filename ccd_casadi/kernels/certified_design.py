@@ -69,8 +69,9 @@ def certificate_grid(wr, wi):
 
 
 @inlined
-def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
-    """How the loop's poles end; its matrices r to e, plant and controller prepared, a grid."""
+def _close(A, B, C, Ak, Bk, Ck, Dk, row):
+    """Evaluate the loop's poles into `row`; return its matrices r to e, plant and controller
+    prepared, a grid."""
     As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
     wr, wi, info = eigenvalues(As)
     row[Column.MAX_REAL_POLE] = wr.max()
@@ -101,8 +102,8 @@ def _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop):
 
 
 @inlined
-def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
-    """How the figures of S end."""
+def _measure(G, K, Dk, omega_low, loop, wr, wi, row):
+    """Measure the figures of S into `row`."""
     As, Bs, Cs = loop
     row[Column.LOW] = sensitivity_gain(G, K, Dk, omega_low)
     value, at, confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
@@ -116,12 +117,12 @@ def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
 
 
 @inlined
-def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
-    """How it ended."""
+def _judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
+    """Judge the design and return its code."""
     row[Column.GAMMA] = gamma
     if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
         return Code.NOT_FINITE.value
-    code, loop, wr, wi, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
+    code, loop, wr, wi, G, K = _close(A, B, C, Ak, Bk, Ck, Dk, row)
     if code != Code.CERTIFIED.value:
         return code
     grid = certificate_grid(wr, wi)
@@ -130,7 +131,7 @@ def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     row[Column.NORM], row[Column.NORM_FREQUENCY] = norm, at
     if not held:
         return Code.LEVEL_TEST_FAILED.value if norm <= gamma else Code.NORM_EXCEEDED.value
-    return _measured(G, K, Dk, omega_low, loop, wr, wi, row)
+    return _measure(G, K, Dk, omega_low, loop, wr, wi, row)
 
 
 @compiled
@@ -151,7 +152,7 @@ def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     row : array (Column.COUNT,)
         Filled in place.
     """
-    row[Column.CODE] = _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+    row[Column.CODE] = _judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
 
 
 # Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
@@ -238,7 +239,8 @@ def failed_row():
 
 
 def _synthesise_channels(A, B, C, w, channels, backoff, guess):
-    """As `synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together.
+    """Synthesise as `synthesise` does, from the blocks: γ_opt is their largest, F at one γ is
+    theirs together.
 
     None where a block is not stable: its observer then corrects the plant's states.
     """

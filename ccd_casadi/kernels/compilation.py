@@ -114,9 +114,9 @@ def _compile_rows(curvature: bool) -> None:
         modes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
         loop_point.levels(first[None], first, square, loop, 0.0, loop_grid.NONE)
-        loop_grid.merged(square, one + 0j, square + 0j, one, (0.5, 2.0), 1e-8, 1e3)
+        loop_grid.merge(square, one + 0j, square + 0j, one, (0.5, 2.0), 1e-8, 1e3)
         loop_grid.maxima(square[..., None, None], square, square, 0.0)
-        loop_grid.unseen(square[..., None, None], square, 0.0)
+        loop_grid.find_unseen(square[..., None, None], square, 0.0)
         loop_point.rows(first, first, first, one, loop)
         loop_point.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
@@ -219,12 +219,12 @@ def _kernels() -> dict[str, Any]:
 
 
 def _folder() -> Path:
-    """Where Numba keeps them, as one module says whose import brings no other."""
+    """Return where Numba keeps the kernels, by one module whose import brings no other."""
     return Path(import_module(f"{PACKAGE}.linear_algebra").schur.stats.cache_path)
 
 
 def _state() -> str:
-    """What compiled kernels depend on: sources, versions, processor."""
+    """Return what compiled kernels depend on: sources, versions, processor."""
     machine = [sys.version, binding.get_host_cpu_name()]
     return "\n".join([sources(), *machine, *(version(name) for name in ("numba", "llvmlite"))])
 

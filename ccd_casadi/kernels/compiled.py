@@ -17,7 +17,8 @@ PACKAGE = __name__.rpartition(".")[0]
 
 
 class _FirstCompilation(event.Listener):
-    """Where a kernel is not on disk: all of its group are compiled at once, with words."""
+    """The listener for a kernel that is not on disk: all of its group are compiled at once, with
+    words."""
 
     def __init__(self) -> None:
         self.alone = "CCD_CASADI_COMPILES" in os.environ  # by itself, one after the other

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.linear_algebra import balanced, schur
+from ccd_casadi.kernels.linear_algebra import balance, schur
 
 
 class ResponseGridOptions(NamedTuple):
-    """How responses over a grid are computed.
+    """Numbers of responses over a grid.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ def prepare(A, B, C):
     T, QᵀD⁻¹B, CDQ : arrays
         With D⁻¹AD = Q T Qᵀ.
     """
-    A, scale = balanced(A)
+    A, scale = balance(A)
     T, Q, _, _, _ = schur(A)
     return T, Q.T.copy() @ (B / scale.reshape(-1, 1)), (C * scale) @ Q
 
@@ -189,15 +189,17 @@ def _apply(C, X):
 
 @compiled
 def _vertex(a, fa, x, fx, b, fb):
-    """Where the parabola through three points, a < x < b, is highest; x if it bends upwards."""
+    """Return where the parabola through three points, a < x < b, is highest; x if it bends
+    upwards."""
     left, right = (fx - fa) / (x - a), (fb - fx) / (b - x)
     bend = (left - right) / (b - a)
     return x + 0.5 * (left / bend - (x - a)) if bend > 0.0 else x
 
 
 @compiled
-def promised(a, fa, x, fx, b, fb):
-    """How far the parabola through three points, a < x < b, rises above fx; inf: it bends upwards.
+def promised_rise(a, fa, x, fx, b, fb):
+    """Return how far the parabola through three points, a < x < b, rises above fx; inf: it bends
+    upwards.
 
     Points beside a pole are not evenly spread: a formula for even steps would promise too little.
     """

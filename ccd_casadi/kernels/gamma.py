@@ -2,7 +2,7 @@
 
 In 1/t the Hamiltonian is affine and f nearly straight, so that Newton's method needs fewer
 steps in 1/t than in t. Near the root the third-order expansion of the stable subspace takes its
-place: a step of order four from one Schur form, whose own terms tell when it is good enough.
+place: a step of order four from one Schur form, whose own terms show when it is good enough.
 """
 
 from typing import NamedTuple
@@ -128,8 +128,9 @@ def rounding_error(frame, t, d1):
 
 
 @inlined
-def undecided(frame, t, f, slope, d1, gamma_jw):
-    """How far above γ_jω, relative, γ_X may yet lie where f > 0 at t, a hair above; 0: nowhere.
+def undecided_range(frame, t, f, slope, d1, gamma_jw):
+    """Return how far above γ_jω, relative, γ_X may yet lie where f > 0 at t, a hair above; 0:
+    nowhere.
 
     At γ_jω f begins like a square root, so that from t down to there it falls by no more than
     twice what its tangent says; rounding moves it by as much as it moves a root.
@@ -161,7 +162,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
         f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t, noise)
         if ok and f > 0.0:
             if t <= t_jw:
-                left = undecided(frame, t, f, slope, d1, gamma_jw)
+                left = undecided_range(frame, t, f, slope, d1, gamma_jw)
                 return gamma_jw, True, forms, True, max(tolerance, left)
             t_high = min(t_high, t)
         else:

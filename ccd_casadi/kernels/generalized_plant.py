@@ -32,7 +32,7 @@ def add(M, row, column, factor, block):
 
 
 @compiled
-def transposed(M):
+def transpose(M):
     """A copy of Mᵀ."""
     out = np.empty((M.shape[1], M.shape[0]))
     place_transposed(out, 0, 0, 1.0, M)
@@ -40,8 +40,8 @@ def transposed(M):
 
 
 @inlined
-def scaled(factor, M):
-    """factor · M."""
+def scale(factor, M):
+    """Compute factor · M."""
     out = np.empty(M.shape)
     place(out, 0, 0, factor, M)
     return out

@@ -74,7 +74,7 @@ class LoopAt(NamedTuple):
 
 
 class MadeFor(NamedTuple):
-    """What a controller is synthesised for.
+    """The data that a controller is synthesised for.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class MadeFor(NamedTuple):
     delta: float = 0.0
 
 
-def _transposed(M):
+def _transpose(M):
     return np.swapaxes(M, -1, -2)
 
 
@@ -153,9 +153,9 @@ def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω, compliance):
         last = _of_gain(G[first:], K[first:], S[first:], True)
         found = tuple(np.concatenate(both) for both in zip(found, last, strict=True))
     s, gap, a, b, Kb = found
-    aG = _transposed(G) @ a
-    lG, rG = np.linalg.solve(_transposed(M), _transposed(C) @ a), GB @ Kb
-    lK, rK = np.linalg.solve(_transposed(Mk), Ck.T @ aG), KB @ b
+    aG = _transpose(G) @ a
+    lG, rG = np.linalg.solve(_transpose(M), _transpose(C) @ a), GB @ Kb
+    lK, rK = np.linalg.solve(_transpose(Mk), Ck.T @ aG), KB @ b
     # dG/dω = -j C M⁻² B, dK/dω likewise
     slope = (1j * ((lG * rG).sum((1, 2)) + (lK * rK).sum((1, 2)))).real
     return a, b, Kb, aG, lG, rG, lK, rK, slope, s, gap
@@ -165,7 +165,7 @@ def _of_gain(G, K, S, compliance):
     """σ_max of S, or of S G, the relative gap to σ_2, and a, b, K b of `_gain_cotangents`."""
     U, s, Vh = np.linalg.svd(S @ G if compliance else S)
     gap = np.ones(len(s)) if s.shape[1] == 1 else (s[:, 0] - s[:, 1]) / s[:, 0]
-    a, v = _transposed(S) @ U[:, :, :1].conj(), _transposed(Vh[:, :1]).conj()
+    a, v = _transpose(S) @ U[:, :, :1].conj(), _transpose(Vh[:, :1]).conj()
     b = S @ (G @ v if compliance else v)
     # (I + KG)⁻¹ v = v - K S G v
     return s[:, 0], gap, a, b, K @ b - v if compliance else K @ b
@@ -201,7 +201,7 @@ def loop_gradients(made_for, posed, gamma_opt, gamma_slope, loops):
     h = aG + B2.T @ lK
     XrK = X @ rK
     X_ = B2 @ _outer(h, rK) / d2**2
-    X_ = 0.5 * (X_ + _transposed(X_))
+    X_ = 0.5 * (X_ + _transpose(X_))
     right = -(inverse @ X_) @ inverse.T
     Lh = np.array([lyapunov_triangular(T11, part, False) for part in right])
     terms, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
@@ -227,7 +227,7 @@ def _changes(plant):
 
 def _outer(x, y):
     """Re x yᵀ of columns."""
-    return (x * _transposed(y)).real
+    return (x * _transpose(y)).real
 
 
 def _contract(cotangents, changes):
@@ -283,7 +283,7 @@ def figure_gradients(
     if row[Column.CODE] != Code.CERTIFIED or row[Column.BALANCED]:
         return *none, to_gamma, True
     with np.errstate(all="ignore"):  # an undefined number is seen in the result
-        posed, gamma_opt, ok = _posed(made_for), float(row[Column.GAMMA_OPT]), True
+        posed, gamma_opt, ok = _pose(made_for), float(row[Column.GAMMA_OPT]), True
         if row[Column.LIMITED_BY_BOUND] > 0.5:
             *slopes, to_weights = _bound_gradient(made_for, grid, sigma)
         else:
@@ -324,7 +324,7 @@ def peak_gradients(
     """
     with np.errstate(all="ignore"):
         found, _, _, gains, _, ok = loop_gradients(
-            made_for, _posed(made_for), float(row[Column.GAMMA_OPT]), gamma_slope, loops
+            made_for, _pose(made_for), float(row[Column.GAMMA_OPT]), gamma_slope, loops
         )
     return found / gains[:, None] if ok else found
 
@@ -341,7 +341,7 @@ def _bound_gradient(made_for, grid, sigma):
     return *parts, np.append(w_, to_delta) if delta else w_
 
 
-def _posed(made_for):
+def _pose(made_for):
     """The generalized plant, its Hamiltonian at γ = ∞, and the way back to plant and weights."""
     plant, w, _, delta = made_for
     A, B, C = plant.A, plant.B, plant.C

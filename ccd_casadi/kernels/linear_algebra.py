@@ -72,7 +72,7 @@ def schur(A):
 
 
 @inlined
-def balanced(A):
+def balance(A):
     """D⁻¹ A D with rows and columns of one size, and D's diagonal, powers of the radix (dgebal)."""
     F = A.T.copy()
     n = F.shape[0]
@@ -169,7 +169,7 @@ def eigenvalues(A):
 
 @compiled
 def multiply(A, B):
-    """A B."""
+    """Compute A B."""
     n, m, count = A.shape[0], B.shape[1], A.shape[1]
     out = np.zeros((n, m), np.complex128)
     for i in range(n):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.frequency import narrow, next_trial, promised, response, responses
+from ccd_casadi.kernels.frequency import narrow, next_trial, promised_rise, response, responses
 from ccd_casadi.kernels.generalized_plant import (
     add,
     first_order_weights,
@@ -40,7 +40,7 @@ def loop_matrices(A, B, C, Ak, Bk, Ck, Dk):
 
 @inlined
 def pole_rounding(A):
-    """What rounding may move an eigenvalue of A by: a pole closer to the axis may lie on it.
+    """Bound what rounding may move an eigenvalue of A by: a pole closer to the axis may lie on it.
 
     10 eps ‖A‖_F, for eigenvalues that are well conditioned; poles of loops have 1e4 times that.
     """
@@ -217,7 +217,7 @@ def stack_norm(G, K, Dk, w, delta, grid):
         for trial in range(OPTIONS.refinements):
             # The parabola's promise is trusted to half, and not at all while the points stand
             # wide: between two of the grid a peak was 1.2 % higher where it promised 0.06 %.
-            promise = fx + 2.0 * promised(a, fa, x, fx, b, fb)
+            promise = fx + 2.0 * promised_rise(a, fa, x, fx, b, fb)
             if promise < 0.9999 * top and (trial > 1 or fx < OPTIONS.refined_from * top):
                 break
             new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)

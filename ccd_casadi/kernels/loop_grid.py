@@ -18,15 +18,15 @@ from ccd_casadi.kernels.loop_point import (
     M,
     S,
     V,
-    broken,
-    closed,
+    fill_loop,
+    gain_kind,
     gain_of,
     over_one_plus_L,
     room,
     row_of,
 )
 from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import GainOf, LoopCurve, gains_and_slopes, second_slopes, warped
+from ccd_casadi.kernels.sections import GainOf, LoopCurve, gains_and_slopes, second_slopes, warp
 
 
 class Answers(NamedTuple):
@@ -49,7 +49,7 @@ NONE = Answers(np.zeros((0, 0), np.int64), *np.zeros((2, 0, 0, 1, 1), complex))
 
 
 @compiled
-def merged(fixed, roots, poles, flanks, ends, apart, far):
+def merge(fixed, roots, poles, flanks, ends, apart, far):
     """Merge frequencies: fixed ones, and those around roots of controller and loops.
 
     Points nearer than `apart` (relative) would hide a peak between them, and count once. Below the
@@ -147,7 +147,7 @@ def maxima(value, v, end, depth):
 
 
 @compiled
-def unseen(value, v, least):
+def find_unseen(value, v, least):
     """Find steps of the grid in which a flat maximum near a bound may lie that no point shows.
 
     A parabola through a step and the point before it ends with a slope of the other sign.
@@ -212,15 +212,15 @@ def second(curve, number, which, v, loop):
     back, ahead = np.empty((max(m, p, q), c), z), np.empty((max(m, p, q), c), z)
     for j in range(v.size):
         gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
-        ω, chain = warped(T, v[j])
+        ω, chain = warp(T, v[j])
         response(terms, residues, T, delay, which[j], ω, chain, False, at, G)
         if curve[j] == LoopCurve.GS:
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
-        closed(into, out, of[K], at)
+        fill_loop(into, out, of[K], at)
         σ, place = gain_of(
             curve[j], number[j], into, out, own, kinds, q, lever, which[j], at, of, sigma
         )
-        kind = broken(curve[j], number[j], p, kinds)
+        kind = gain_kind(curve[j], number[j], p, kinds)
         columns = q if curve[j] == LoopCurve.GS else p
         if kind != GainOf.ROW:  # one entry of S has no other singular value
             columns = 1
@@ -258,9 +258,8 @@ def _over_gap(σ, other):
 @inlined
 def _by_channel(curve, number, kind, place, into, out, own, forces, lever, of_plant, at, of,
                 crossed, moved, back, ahead):  # fmt: skip
-    """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
-    of z_m (m, c).
-    """
+    """Fill left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts of z_m (m, c) for
+    ∂ln K_i = 1."""
     (m, c), p, at_actuator = into.shape, out.shape[1], kind == GainOf.ACTUATOR
     shared = m == 1 and p > 1
     one = over_one_plus_L(out, of[K], at) if shared else 1.0 + 0.0j

@@ -14,7 +14,7 @@ from ccd_casadi.kernels.sections import (
     gains_and_slopes,
     inverse,
     offset,
-    warped,
+    warp,
 )
 
 # What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (10, w)
@@ -86,7 +86,7 @@ def over_one_plus_L(out, k, at):
 
 
 @compiled
-def closed(into, out, k, at):
+def fill_loop(into, out, k, at):
     """Fills G V, G K, S and Uᵀ S from G and K_i (c,)."""
     (m, c), p = into.shape, out.shape[1]
     for a in range(p):
@@ -197,7 +197,7 @@ def row_of(row, M, rows, columns):
 
 
 @compiled
-def broken(curve, number, p, kinds):
+def gain_kind(curve, number, p, kinds):
     """`GainOf` a number: one place alone of S and T where it says so, else rows and whole gains."""
     found = 0
     if number >= p and curve != LoopCurve.KS and curve != LoopCurve.GS:
@@ -209,7 +209,7 @@ def broken(curve, number, p, kinds):
 def own_gain(curve, i, into, out, k, own, kinds, q, at):
     """Gain of channel i's own; its row is in M's first row, of one place its entry."""
     (m, c), p = into.shape, out.shape[1]
-    kind = broken(curve, p + i, p, kinds)
+    kind = gain_kind(curve, p + i, p, kinds)
     if kind == GainOf.ACTUATOR:  # (I + KG)⁻¹ = I - K S G, K = V diag(K_i) Uᵀ
         for a in range(m):
             for b in range(m):
@@ -240,7 +240,7 @@ def own_gain(curve, i, into, out, k, own, kinds, q, at):
 def gain_of(curve, number, into, out, own, kinds, q, lever, of_plant, at, of, sigma):
     """σ of one gain and the column of its v in V; fills V, σ, ũ, x, right, left, share and y."""
     (m, c), p, z = into.shape, out.shape[1], lever.shape[1]
-    kind, place = broken(curve, number, p, kinds), number
+    kind, place = gain_kind(curve, number, p, kinds), number
     columns = q if curve == LoopCurve.GS else p
     rows = m if curve == LoopCurve.KS else p
     levered = curve == LoopCurve.GS and z > 0
@@ -375,7 +375,7 @@ def levels(curves, which, v, loop, least, answers):
     sensitivity = np.empty(p)
     for i in range(count):
         for j in range(most):
-            ω, chain = warped(T, v[i, j])
+            ω, chain = warp(T, v[i, j])
             gains(factors, values, complex(0.0, v[i, j]), k)
             place = places[i, j] if places.size else -1
             if place < 0:
@@ -387,7 +387,7 @@ def levels(curves, which, v, loop, least, answers):
                 for a in range(answers.free.shape[2]):
                     for b in range(q):
                         at[FREE, a, b] = answers.free[which[i], place, a, b]
-            closed(into, outputs, k, at)
+            fill_loop(into, outputs, k, at)
             height, known = np.nan, False  # of S: ln of its largest gain, and of all others
             for c in range(curves.shape[1]):
                 curve = curves[i, c]
@@ -460,12 +460,12 @@ def rows(curve, number, which, v, loop):
     x, y = np.empty((count, wide), np.complex128), np.empty((count, m), np.complex128)
     w = np.zeros((count, q), np.complex128)
     for j in range(count):
-        before, of_gs, (ω, chain) = j - 1, curve[j] == LoopCurve.GS, warped(T, v[j])
+        before, of_gs, (ω, chain) = j - 1, curve[j] == LoopCurve.GS, warp(T, v[j])
         known = j > 0 and v[j] == v[before] and which[j] == which[before]
         if not known:
             gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
             response(terms, residues, T, delay, which[j], ω, chain, True, at, G)
-            closed(into, out, of[K], at)
+            fill_loop(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
             response(free[0], free[1], 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
         σ, place = gain_of(

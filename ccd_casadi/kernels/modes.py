@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.sections import inverse, warped
+from ccd_casadi.kernels.sections import inverse, warp
 
 
 class CancellationOptions(NamedTuple):
-    """When a difference is computed by expm1.
+    """The threshold below which a difference is computed by expm1.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ def responses(plants, which, v):
     """
     out = np.empty((v.size, 2, plants.residues.shape[3], plants.residues.shape[4]), np.complex128)
     for j in range(v.size):
-        ω, chain = warped(plants.period, v[j])
+        ω, chain = warp(plants.period, v[j])
         response(
             plants.terms, plants.residues, plants.period, plants.delay, which[j], ω, chain, True,
             out[j], 0,
@@ -215,7 +215,7 @@ def form_slopes(slopes, which, v, x, y, free):
     out = np.zeros((v.size, count))
     f, own, slope, c, b = np.empty((5, n), np.complex128)
     for k in range(v.size):
-        i, ω = which[k], warped(period, v[k])[0]
+        i, ω = which[k], warp(period, v[k])[0]
         s, z = complex(0.0, ω), complex(np.cos(ω * T), np.sin(ω * T))
         turn = complex(np.cos(ω * T * d), -np.sin(ω * T * d))
         for a in range(n):

@@ -10,9 +10,9 @@ from ccd_casadi.kernels.generalized_plant import (
     frobenius,
     place,
     place_transposed,
-    scaled,
+    scale,
     symmetric_part,
-    transposed,
+    transpose,
 )
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, solve, stable_subspace
 
@@ -37,7 +37,7 @@ def lqr_hamiltonian(gp):
     N, p, m = A.shape[0], C2.shape[0], B2.shape[1]
     S2 = np.empty((m, N))
     place(S2, 0, 0, d2, C1[p : p + m])
-    BS, BB, SS, CC = B2 @ S2, B2 @ transposed(B2), transposed(S2) @ S2, transposed(C1) @ C1
+    BS, BB, SS, CC = B2 @ S2, B2 @ transpose(B2), transpose(S2) @ S2, transpose(C1) @ C1
     H = np.empty((2 * N, 2 * N))
     for i in range(N):
         for j in range(N):
@@ -68,10 +68,10 @@ def level_hamiltonian(H0, B1, C1, d1, t):
 
 
 @compiled
-def projected(U1, U2):
+def project(U1, U2):
     """Singular vectors P, Q and values c of U1, and s_i = p_iᵀ U2 q_i: λ(X) = s/c at a root."""
     P, c, Qt = np.linalg.svd(U1)
-    Q = transposed(Qt)
+    Q = transpose(Qt)
     M = U2 @ Q
     s = np.zeros(c.size)
     for i in range(c.size):
@@ -95,16 +95,16 @@ def riccati_level(H0, B1, C1, d1, t, noise):
     T11, U1, U2, _, ok = stable_subspace(H)
     if not ok:
         return -np.inf, 0.0, False, (H, T11, U1, U2, U1, U1, np.zeros(N), np.zeros(N), 0.0)
-    P, c, Q, s = projected(U1, U2)
+    P, c, Q, s = project(U1, U2)
     f, s_best, index = np.inf, 1.0, N - 1
     for i in range(N):
         # |s| = |λ|/√(1+λ²)
         if abs(s[i]) > noise and c[i] / s[i] < f:
             f, s_best, index = c[i] / s[i], s[i], i
     q, left = Q[:, index].copy(), P[:, index].copy()
-    V = transposed(B1) @ U2
+    V = transpose(B1) @ U2
     add(V, 0, 0, d1, C1[:p] @ U1)
-    Z = lyapunov_triangular(T11, scaled(-1.0, transposed(V) @ V), True)
+    Z = lyapunov_triangular(T11, scale(-1.0, transpose(V) @ V), True)
     slope = np.dot(q, Z @ q) / (s_best * t) ** 2
     return f, slope, True, (H, T11, U1, U2, V, Z, q, left, c[index])
 
@@ -128,7 +128,7 @@ def _singularity(U1, U2, Z, q, p):
 
 @inlined
 def root_nearby(B1, C1, d1, frame, δ, noise):
-    """Where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
+    """Find where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
 
     The estimate is infinite where X is negative there in another direction: its root is higher.
 
@@ -142,7 +142,7 @@ def root_nearby(B1, C1, d1, frame, δ, noise):
     """
     H, T11, U1, U2, V, Z1, q, p, c = frame
     N, outputs = B1.shape
-    W = transposed(B1) @ U1
+    W = transpose(B1) @ U1
     add(W, 0, 0, -d1, C1[:outputs] @ U2)
     # G = [U1; U2]ᵀ H [-U2; U1]
     left, right = np.empty((N, 2 * N)), np.empty((2 * N, N))
@@ -150,13 +150,13 @@ def root_nearby(B1, C1, d1, frame, δ, noise):
     place_transposed(left, 0, N, 1.0, U2)
     place(right, 0, 0, -1.0, U2)
     place(right, N, 0, 1.0, U1)
-    G, VW = left @ (H @ right), transposed(V) @ W
+    G, VW = left @ (H @ right), transpose(V) @ W
     WZ, GZ = W @ Z1, G @ Z1
     M = VW @ Z1
     add(M, 0, 0, 0.5, Z1 @ GZ)
     Z2 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
     M = VW @ Z2
-    add(M, 0, 0, 0.5, transposed(WZ) @ WZ)
+    add(M, 0, 0, 0.5, transpose(WZ) @ WZ)
     add(M, 0, 0, 1.0, Z2 @ GZ)
     Z3 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
     δ0, g0 = 0.0, -c
@@ -181,7 +181,7 @@ def root_nearby(B1, C1, d1, frame, δ, noise):
     top, low = U1.copy(), U2.copy()
     add(top, 0, 0, -1.0, U2 @ Z)
     add(low, 0, 0, 1.0, U1 @ Z)
-    if np.linalg.eigvalsh(symmetric_part(transposed(top) @ low, 0.5))[0] < -noise:
+    if np.linalg.eigvalsh(symmetric_part(transpose(top) @ low, 0.5))[0] < -noise:
         return δ, np.inf
     n1, n2, n3 = frobenius(Z1), frobenius(Z2), frobenius(Z3)
     first = abs(np.dot(q, Z1 @ q))
@@ -234,10 +234,11 @@ def in_coordinates(gp, τ):
 
 
 def rounding_noise(H0):
-    """What rounding alone makes of a projection that is zero: X(γ = ∞) is positive semidefinite.
+    """Estimate what rounding alone makes of a projection that is zero: X(γ = ∞) is positive
+    semidefinite.
 
     Four times the most negative one there, at least `RiccatiOptions.noise`.
     """
     _, U1, U2, _, ok = stable_subspace(H0)
     least = RiccatiOptions.noise
-    return max(least, -4.0 * projected(U1, U2)[3].min()) if ok else least
+    return max(least, -4.0 * project(U1, U2)[3].min()) if ok else least

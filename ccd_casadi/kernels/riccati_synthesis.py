@@ -15,7 +15,7 @@ from ccd_casadi.kernels.generalized_plant import (
     plant_matrices,
     squared_weights,
     symmetric_part,
-    transposed,
+    transpose,
 )
 from ccd_casadi.kernels.linear_algebra import solve, stable_subspace
 from ccd_casadi.kernels.riccati import (
@@ -161,11 +161,11 @@ def central_controller(gp, H0, gamma):
     t = gamma**2 - d1**2
     _, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
     N = Ag.shape[0]
-    X, regular = solve(transposed(U1), transposed(U2))
+    X, regular = solve(transpose(U1), transpose(U2))
     if not (ok and regular):
         return np.zeros((N, N)), B1, np.zeros((m, N)), False
     X = symmetric_part(X, 0.5)
-    F, Ak = transposed(B2) @ X, Ag.copy()
+    F, Ak = transpose(B2) @ X, Ag.copy()
     for i in range(m):
         for j in range(N):
             F[i, j] = -(F[i, j] + d2 * C1[p + i, j]) / d2**2
@@ -194,8 +194,9 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 
 
 @compiled
-def _mixed(A, B, C, w, grid, sigma):
-    """What the generalized plant of mixed sensitivity has, γ_jω, and the largest Re of a pole."""
+def _prepare(A, B, C, w, grid, sigma):
+    """Prepare the data of the generalized plant of mixed sensitivity, γ_jω, and the largest Re of a
+    pole."""
     G = prepare(A, B, C)
     bound, rate = gamma_lower_bound(G, w, grid, sigma)[0], -np.inf
     for i in range(G[0].shape[0]):
@@ -227,7 +228,7 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
     """
     modes = None
     if delta == 0.0:
-        matrices, bound, rate = _mixed(A, B, C, w, grid, sigma)
+        matrices, bound, rate = _prepare(A, B, C, w, grid, sigma)
         modes = unstable_modes(A, C) if rate > 0.0 else None
         gp = unstable_plant(A, B, C, w, modes) if modes else MixedPlant(*matrices)
     else:
@@ -237,16 +238,16 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
             row[Column.CODE], row[Column.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
             return row, none, none, none
         gp, bound = innovations_plant(A, B, C, w, Y), disturbance_bound(A, B, C, w, delta, grid)[0]
-    row, *K = _solved(gp, bound, backoff, guess, balanced)
+    row, *K = _solve(gp, bound, backoff, guess, balanced)
     if modes and row[Column.CODE] == Code.CERTIFIED:
         K = without_copies(*K, modes)
     return row, *K
 
 
-def _solved(gp, bound, backoff, guess, balanced):
+def _solve(gp, bound, backoff, guess, balanced):
     """`synthesise` on a generalized plant."""
     if balanced:
-        gp, H0, τ = _balanced(gp, bound)
+        gp, H0, τ = _balance(gp, bound)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
             row, *K = _search_and_control(gp, H0, bound, backoff, guess, rounding_noise(H0))
             return row, *_in_own_coordinates(*K, τ)
@@ -264,7 +265,7 @@ def _in_own_coordinates(Ak, Bk, Ck, τ):
     return Ak * (back / τ), Bk * back, Ck / τ
 
 
-def _balanced(gp, bound):
+def _balance(gp, bound):
     """The generalized plant and H0 in balanced coordinates, and τ."""
     t = max((1.3 * bound) ** 2 - gp.d1**2, 1e-12)  # where the search begins
     with np.errstate(all="ignore"):
@@ -275,7 +276,7 @@ def _balanced(gp, bound):
 
 def _with_a_better_optimum(row, K, gp, bound, backoff):
     """γ_opt and K from balanced coordinates where γ_opt agrees with what was found, or that."""
-    gp, H0, τ = _balanced(gp, bound)
+    gp, H0, τ = _balance(gp, bound)
     gamma_opt, error = float(row[Column.GAMMA_OPT]), float(row[Column.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
         H0, gp.B1, gp.C1, gp.d1, bound, gamma_opt, OPTIONS.gamma_tolerance, RiccatiOptions.noise

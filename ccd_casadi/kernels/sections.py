@@ -69,7 +69,8 @@ class Limit(IntEnum):
 
 
 class GainOf(IntEnum):
-    """What a channel's own gain is of S, and where the loop is broken at one place alone.
+    """The part of S that a channel's own gain is of, and where the loop is broken at one place
+    alone.
 
     Attributes
     ----------
@@ -85,7 +86,7 @@ class GainOf(IntEnum):
 
 
 @compiled
-def warped(T, v):
+def warp(T, v):
     """ω = (2/T) arctan(T v/2) and ∂ln ω/∂ln v of a loop with period T (0: continuous, ω = v).
 
     By Tustin's rule K at e^{jωT} is the continuous K at jv.

@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
-from ccd_casadi.kernels.generalized_plant import add, place, place_transposed, transposed
+from ccd_casadi.kernels.generalized_plant import add, place, place_transposed, transpose
 from ccd_casadi.kernels.linear_algebra import eigenvalues, invert, largest_singular, multiply
 
 
@@ -82,7 +82,7 @@ def axis_frequencies(A, B, C, D, level):
         Of LAPACK; 0: success.
     """
     n, m = B.shape
-    Dt = transposed(D)
+    Dt = transpose(D)
     R = np.zeros((m, m))
     for i in range(m):
         R[i, i] = level**2
@@ -96,9 +96,9 @@ def axis_frequencies(A, B, C, D, level):
     F, H = A.copy(), np.empty((2 * n, 2 * n))
     add(F, 0, 0, 1.0, B @ RDC)
     place(H, 0, 0, 1.0, F)
-    place(H, 0, n, 1.0, (B @ R) @ transposed(B))
-    place(H, n, 0, -1.0, transposed(C) @ C)
-    add(H, n, 0, -1.0, transposed(DC) @ RDC)
+    place(H, 0, n, 1.0, (B @ R) @ transpose(B))
+    place(H, n, 0, -1.0, transpose(C) @ C)
+    add(H, n, 0, -1.0, transpose(DC) @ RDC)
     place_transposed(H, n, n, -1.0, F)
     wr, wi, info = eigenvalues(H)
     found = np.empty(2 * n)

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.lti.frequency_grid import local_maxima, zoomed
-from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, sampled
+from ccd_casadi.lti.frequency_grid import local_maxima, zoom
+from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, zoh
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, sensitivity, sigma_max
 from ccd_casadi.support.arrays import Array
@@ -60,7 +60,7 @@ class BetweenSamples:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json and deploy.json."""
+        """The entry of result.json and deploy.json."""
         return {
             "sensitivity_peak": self.peak,
             "at_instants": self.at_instants,
@@ -75,7 +75,7 @@ def held_between(G: StateSpace, period: float, delay: float, times: Sequence[flo
     u_{k-d-1} acts until the rest of the delay is over, then u_{k-d}. `G` is continuous, without
     feedthrough; of its p outputs there are N p, those of the first τ first.
     """
-    held, (n, m) = sampled(G, period, delay), G.B.shape
+    held, (n, m) = zoh(G, period, delay), G.B.shape
     whole, rest = delay_parts(period, delay)
     joint = np.zeros((n + m, n + m))
     joint[:n, :n], joint[:n, n:] = G.A, G.B
@@ -133,7 +133,7 @@ def peak_between(loop: Loop, options: BetweenOptions = BetweenOptions()) -> Betw
     grid = loop.grid()
     values = largest(grid)
     near = [i for i in local_maxima(values) if values[i] > options.near * values.max()]
-    at, heights = zoomed(largest, grid[np.array(near, int) - 1], grid[np.array(near, int) + 1])
+    at, heights = zoom(largest, grid[np.array(near, int) - 1], grid[np.array(near, int) + 1])
     omega = np.append(at, grid[np.argmax(values)])
     top = omega[np.argmax(np.append(heights, values.max()))]
     each = gains(np.array([top]))[:, 0]

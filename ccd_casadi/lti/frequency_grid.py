@@ -87,7 +87,7 @@ def frequency_grid(
     return np.asarray(grid[np.append(True, np.diff(grid) > apart * grid[1:])])
 
 
-def thinned(values: Array, width: float) -> Array:
+def thin(values: Array, width: float) -> Array:
     """Keep the least value of each interval of ln ω.
 
     Parameters
@@ -127,7 +127,7 @@ def local_maxima(values: Array) -> np.ndarray:
     return np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
-def zoomed(
+def zoom(
     function: Callable[[Array], Array],
     low: Array,
     high: Array,

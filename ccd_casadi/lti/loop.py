@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoom
 from ccd_casadi.lti.ports import BreakPoint, Ports, ports_of
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
@@ -23,7 +23,7 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the loop runs.
+    """The rate of a sampled loop, and its delay.
 
     Parameters
     ----------
@@ -42,18 +42,18 @@ class Sampling:
 
     @property
     def period(self) -> float:
-        """T in s."""
+        """The period T in s."""
         return 1.0 / self.rate_hz
 
     @property
     def delay(self) -> float:
-        """τ in s."""
+        """The delay τ in s."""
         return 1e-6 * self.delay_us
 
 
 @dataclass(frozen=True)
 class DelayOptions:
-    """How a delay is split.
+    """Numbers of the split of a delay.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ def moment_slopes(p: np.ndarray, T: float, delay: float) -> tuple[np.ndarray, np
     return d_late, d_early
 
 
-def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
+def zoh(G: StateSpace, period: float, delay: float) -> StateSpace:
     """Discretise a plant behind hold and delay, u_k to y_k.
 
     One exponential over each part of a period: before and after the delayed force changes. Analytic
@@ -172,10 +172,10 @@ def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
         early = expm(joint * rest)[:n]
         gains.append(A @ early[:, n:])
         A = A @ early[:, :n]
-    return delayed(A, gains, G.C, period)
+    return with_delays(A, gains, G.C, period)
 
 
-def delayed(A: np.ndarray, gains: Sequence[np.ndarray], C: np.ndarray, T: float) -> StateSpace:
+def with_delays(A: np.ndarray, gains: Sequence[np.ndarray], C: np.ndarray, T: float) -> StateSpace:
     """Make one state space of x_{k+1} = A x_k + Σ gains_i u_{k-i}, y = C x.
 
     Parameters
@@ -287,7 +287,7 @@ class Loop:
 
     @cached_property
     def ports(self) -> Ports:
-        """Where disturbing forces act, and what counts."""
+        """The places where disturbing forces act, and what counts."""
         return ports_of(self.plant, self.at, self.drive, self.counted, self.force)
 
     @property
@@ -295,20 +295,20 @@ class Loop:
         """Whether forces act, or the error counts, elsewhere than at its actuators and sensors."""
         return self.drive is not None or self.counted is not None
 
-    def moved(self, omega: Array) -> np.ndarray:
-        """What counts per disturbing force (k, z, q), of a sampled loop at its instants."""
+    def force_responses(self, omega: Array) -> np.ndarray:
+        """Compute what counts per disturbing force (k, z, q), of a sampled loop at its instants."""
         plant, ports, p = self.plant, self.ports, len(self.plant.C)
         C = np.vstack([plant.C, ports.counted])
         whole = replace(self, plant=strictly_proper(plant.A, plant.B, C), drive=None, counted=None)
         (G, K), free = whole.run_responses(omega), strictly_proper(plant.A, ports.drive, C)
-        d = free.swept(omega)
+        d = free.sweep(omega)
         u = np.linalg.solve(np.eye(G.shape[2]) + K @ G[:, :p], K @ d[:, :p])
         return np.asarray(d[:, p:] - G[:, p:] @ u)
 
     @property
     def compliance(self) -> float:
         """The largest σ_max of `moved`, m/N."""
-        return self._largest(lambda omega: sigma_max(self.moved(omega)))
+        return self._largest(lambda omega: sigma_max(self.force_responses(omega)))
 
     @property
     def places(self) -> "list[Loop]":
@@ -318,7 +318,7 @@ class Loop:
     def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         """G (k, p, m), hold and delay in it, and K (k, m, p) as they run, at ω (k,) in rad/s."""
         G, K = self.run_responses(omega)
-        return self.at[0].opened(G, K) if self.at else (G, K)
+        return self.at[0].open_loop(G, K) if self.at else (G, K)
 
     def curves(self, omega: Array) -> dict[str, np.ndarray]:
         """S, T, KS and GS as matrices (k, ·, ·); KS the whole force."""
@@ -327,14 +327,14 @@ class Loop:
             G, K = self.run_responses(omega)
             found["KS"] = K @ np.array([self.at[0].reference]).T / (1.0 + K @ G)
         if self.ported:
-            found["GS"] = self.moved(omega)
+            found["GS"] = self.force_responses(omega)
         return found
 
     def run_responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """As `responses`, at no place where the loop is broken."""
-        K = self.as_run[1].swept(omega)
+        """Evaluate `responses` with the loop broken at no place."""
+        K = self.as_run[1].sweep(omega)
         if self.sampling is None:
-            return self.plant.swept(omega), K
+            return self.plant.sweep(omega), K
         omega = self.plant.off_poles(omega, self.sampling.period)
         return held(self.plant, omega, self.sampling), K
 
@@ -348,7 +348,7 @@ class Loop:
         """The closed loop, sampled at its instants; a disturbing force is held, and not delayed."""
         found = closed_loop(*self.as_run)
         if self.at:
-            found = self.at[0].closed(found)
+            found = self.at[0].close_loop(found)
         if self.sampling is None and not self.ported:
             return found
         drive, n = self.plant.B if self.drive is None else self.drive, len(self.plant.A)
@@ -356,7 +356,7 @@ class Loop:
         force[:n] = drive
         if self.sampling is not None:
             held = strictly_proper(self.plant.A, drive, self.plant.C)
-            force[:n] = sampled(held, self.sampling.period, 0.0).B
+            force[:n] = zoh(held, self.sampling.period, 0.0).B
         if self.ported:
             counted = np.zeros((len(self.ports.counted), len(found.A)))
             counted[:, :n] = self.ports.counted
@@ -411,7 +411,7 @@ class Loop:
         S = gain(grid)
         at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
         at = at[S[at] > 0.9 * S.max()]  # lower ones are lower between the points, too
-        return float(max((S.max(), *zoomed(gain, grid[at - 1], grid[at + 1])[1])))
+        return float(max((S.max(), *zoom(gain, grid[at - 1], grid[at + 1])[1])))
 
     @cached_property
     def as_run(self) -> tuple[StateSpace, StateSpace]:
@@ -421,7 +421,7 @@ class Loop:
         T, K = self.sampling.period, self.controller
         K = K if K.period else tustin(K, T)
         K = K if K.period == T else replace(K, period=T)
-        return sampled(self.plant, T, self.sampling.delay), K
+        return zoh(self.plant, T, self.sampling.delay), K
 
 
 def held(plant: StateSpace, omega: Array, sampling: Sampling) -> np.ndarray:
@@ -435,13 +435,13 @@ def held(plant: StateSpace, omega: Array, sampling: Sampling) -> np.ndarray:
         return np.asarray((reading * f[:, None, :]) @ drive)
     if plant.at_rest is not None:
         return np.asarray(sum(held(part, omega, sampling) for part in plant.at_rest))
-    return sampled(plant, sampling.period, sampling.delay).swept(omega)
+    return zoh(plant, sampling.period, sampling.delay).sweep(omega)
 
 
 def at_instants(loop: ClosedLoop, period: float) -> ClosedLoop:
     """A continuous loop at instants `period` s apart, r and d constant in between; exact."""
     both = np.hstack([loop.B_r, loop.B_d])
-    held = sampled(strictly_proper(loop.A, both, loop.C_y), period, 0.0)
+    held = zoh(strictly_proper(loop.A, both, loop.C_y), period, 0.0)
     count = loop.B_r.shape[1]
     return replace(loop, A=held.A, B_r=held.B[:, :count], B_d=held.B[:, count:], period=period)
 

@@ -11,7 +11,7 @@ from scipy.linalg import eigvals, solve
 
 from ccd_casadi.lti.frequency_grid import root_flanks
 from ccd_casadi.lti.loop import in_w
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.support.arrays import Array
 
 
@@ -115,13 +115,13 @@ def hinf_norm(
         return norm, float(2.0 / T * np.arctan(0.5 * v * T))
     if not len(system.A):
         return float(np.linalg.norm(system.D, 2)), 0.0
-    A, B, C = balanced(system.A, system.B, system.C)
+    A, B, C = balance_system(system.A, system.B, system.C)
     scaled = StateSpace(A, B, C, system.D)
     poles = np.linalg.eigvals(A)
     if not poles.real.max() < 0.0:
         return np.inf, float(abs(poles[np.argmax(poles.real)].imag))
     omega = _first_grid(poles) if start is None else np.array([start, np.inf])
-    best, at = _climbed(scaled, omega, options)
+    best, at = _climb(scaled, omega, options)
     for _ in range(options.rounds):
         level = best * (1.0 + options.resolution)
         if level == 0.0:
@@ -140,7 +140,7 @@ def hinf_norm(
     return best, at
 
 
-def _climbed(system: StateSpace, omega: Array, options: NormOptions) -> tuple[float, float]:
+def _climb(system: StateSpace, omega: Array, options: NormOptions) -> tuple[float, float]:
     """The largest gain, and its ω, on ascending frequencies and on finer ones beside its maxima.
 
     A flat maximum far below the other poles is an eigenvalue of the Hamiltonian that rounding moves

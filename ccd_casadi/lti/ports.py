@@ -11,7 +11,7 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class BreakPoint:
-    """Where the loop of several sensors on one actuator is broken.
+    """A place where the loop of several sensors on one actuator is broken.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class BreakPoint:
     output: tuple[float, ...] = ()
     reference: tuple[float, ...] = ()
 
-    def opened(self, G: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def open_loop(self, G: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The loop that is left, as a plant and a controller of one channel.
 
             L_i = G_i K_i/(1 + Σ_{j≠i} G_j K_j) at sensor i,   L = Σ_j G_j K_j at the actuator
@@ -44,7 +44,7 @@ class BreakPoint:
         own, gain = np.array([self.output]) @ G, K @ np.array([self.reference]).T
         return own / (1.0 + L - own * gain), gain
 
-    def closed(self, loop: ClosedLoop) -> ClosedLoop:
+    def close_loop(self, loop: ClosedLoop) -> ClosedLoop:
         """The closed loop, whose S is that of the loop broken here."""
         if not self.output:
             none = np.zeros((1, 1))
@@ -55,7 +55,8 @@ class BreakPoint:
 
 @dataclass(frozen=True)
 class Ports:
-    """Where forces d act, what z counts, and what a setpoint s requires of them.
+    """The ports of a plant: where forces d act, what z counts, and what a setpoint s requires of
+    them.
 
         ẋ = A x + B u + E d,   y = C x,   z = F x = W U y + N x,   e = W s - z,   r = R s,   f = P x
 

@@ -48,7 +48,7 @@ class StateSpace:
         """
         return self.at(self.variable(omega))
 
-    def swept(self, omega: Array) -> np.ndarray:
+    def sweep(self, omega: Array) -> np.ndarray:
         """`response` at many frequencies: by eigenvectors where these are sound (cond < 1e8).
 
         `off_poles`, so that loops of undamped plants have S, KS, T and GS there.
@@ -56,7 +56,7 @@ class StateSpace:
         omega = self.off_poles(omega)
         if self.modes is None and self.at_rest is not None:
             rest, others = self.at_rest
-            return rest.swept(omega) + others.swept(omega)
+            return rest.sweep(omega) + others.sweep(omega)
         if self.modes is None:
             return self.response(omega)
         poles, drive, reading = self.modes
@@ -90,7 +90,7 @@ class StateSpace:
 
     @property
     def poles(self) -> np.ndarray:
-        """Eigenvalues of A."""
+        """The eigenvalues of A."""
         return np.linalg.eigvals(self.A)
 
     @property
@@ -128,7 +128,7 @@ class StateSpace:
         C (s - A)⁻¹ B = C₁ (s - T₁₁)⁻¹ (B₁ - Y B₂) + (C₁ Y + C₂) (s - T₂₂)⁻¹ B₂. None without such
         poles, without others, and in discrete time.
         """
-        own = self.balanced()
+        own = self.balance()
         sizes = np.abs(own.poles)  # in these units two poles at 0 do not split by rounding
         if self.period or not 0 < (sizes == 0.0).sum() < len(sizes):
             return None
@@ -159,13 +159,13 @@ class StateSpace:
         values = eig(system, weight, right=False)
         return np.asarray(values[np.isfinite(values) & (np.abs(values) < infinite)] * unit)
 
-    def balanced(self) -> "StateSpace":
-        """The same in states of even scales (`balanced`).
+    def balance(self) -> "StateSpace":
+        """The same in states of even scales (`balance_system`).
 
         The gains of leads multiply along a cascade of sections: its states lie up to 17 decades
         apart, and nothing is left of the digits of |S| in a closed loop.
         """
-        A, B, C = balanced(self.A, self.B, self.C)
+        A, B, C = balance_system(self.A, self.B, self.C)
         return StateSpace(A, B, C, self.D, period=self.period)
 
     def series(self, then: "StateSpace") -> "StateSpace":
@@ -202,7 +202,7 @@ def strictly_proper(A: Array, B: Array, C: Array, period: float = 0.0) -> StateS
     return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), period=period)
 
 
-def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+def balance_system(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     """Balance a system: T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two.
 
     T evens out the states' scales. Inputs and outputs keep their units: balancing does not change
@@ -223,7 +223,7 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
 
 
 def state_scales(A: Array, B: Array, C: Array) -> Array:
-    """Find the T of `balanced`.
+    """Find the T of `balance_system`.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def leading_term(A: Array, B: Array, C: Array, *, rounding: float = 1e-13) -> tu
     return order, found.get(order, C @ B)
 
 
-def weighted(system: StateSpace, filters: Array) -> StateSpace:
+def filter_outputs(system: StateSpace, filters: Array) -> StateSpace:
     """Filter each output of a continuous system: through (s + zero)/(s + pole).
 
     Parameters

@@ -187,7 +187,7 @@ class Wiring:
 
     @property
     def words(self) -> str:
-        """What a reader of figures must know."""
+        """The wiring in words, as a reader of figures must know it."""
         both = (("[actuator]", self.actuator), ("[sensor]", self.sensor))
         there = [f"{name} {own.words}" for name, own in both if own]
         words = "disturbing forces act on the machine, its unfiltered position counts"
@@ -206,7 +206,8 @@ class Wiring:
         return None if actuator is None or sensor is None else np.append(actuator, sensor)
 
     def of_output(self, row: Array) -> "Wiring":
-        """Of the one output rowᵀy. Raises PlantError where it mixes sensors that differ."""
+        """Return the wiring of the one output rowᵀy. Raises PlantError where it mixes sensors that
+        differ."""
         there, own = np.flatnonzero(row), {}
         for key in ("lag_hz", "second_order_hz", "damping"):
             values = getattr(self.sensor, key)

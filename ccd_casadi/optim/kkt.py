@@ -151,7 +151,7 @@ class ActiveSet:
 
     @property
     def size(self) -> float:
-        """‖∇J‖∞."""
+        """The scale ‖∇J‖∞."""
         return max(float(np.abs(self.gradient).max()), 1e-300)
 
     def multipliers(self) -> Array:
@@ -159,7 +159,7 @@ class ActiveSet:
         return non_negative(self.rows, -self.gradient)[0]
 
     def residual(self, mu: Array) -> float:
-        """‖∇J + Aᵀμ‖∞/‖∇J‖∞."""
+        """Compute ‖∇J + Aᵀμ‖∞/‖∇J‖∞."""
         return float(np.abs(self.gradient + mu @ self.rows).max()) / self.size
 
     def free(self, mu: Array) -> Array:

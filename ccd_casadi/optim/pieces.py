@@ -30,7 +30,7 @@ class Box(NamedTuple):
 
     @property
     def width(self) -> Array:
-        """Of its sides (n,)."""
+        """The widths of its sides (n,)."""
         return self.upper - self.lower
 
     def shares(self, x: ArrayLike) -> Array:
@@ -192,7 +192,7 @@ class _Pieces(TrustRegionModel[Local]):
 
     def at(self, x: Array) -> Iterate[Local] | None:
         """A point with λ <= 0, and one piece more."""
-        z = _restored(np.clip(x, 0.0, 1.0), self.constraints, self.numbers)
+        z = _restore(np.clip(x, 0.0, 1.0), self.constraints, self.numbers)
         there = None if z is None else self.J(z)
         return None if there is None else self.iterate(there)
 
@@ -216,10 +216,11 @@ class _Pieces(TrustRegionModel[Local]):
             hard=np.arange(len(chosen) + len(g)) >= len(chosen),
         )
 
-    def learnt(
+    def learn(
         self, H: Array, here: Iterate[Local], there: Iterate[Local], step: Step, radius: float
     ) -> Array:
-        """That of the pieces' combination; after a step too far along one piece, of that one."""
+        """Update the Hessian of the pieces' combination; after a step too far along one piece, of
+        that one."""
         a, b, moved, numbers = here.data, there.data, there.x - here.x, self.numbers
         change = b.gradient - a.gradient
         if b.value >= a.value:
@@ -236,30 +237,31 @@ class _Pieces(TrustRegionModel[Local]):
             held, holding = (int(count.sum()) for count in counts)
             if held != holding:
                 return H  # across a kink that has just been met the slopes show no curvature
-            change = self._combined(after) - self._combined(step)
+            change = self._combine(after) - self._combine(step)
         if not H.any():
             seen = abs(float(moved @ change)) / float(moved @ moved)
             H = max(seen, 1e-3 * float(np.abs(there.data.gradient).max())) * np.eye(len(H))
         return damped_bfgs(H, moved, change) if H.any() else H
 
-    def ended(self, here: Iterate[Local], there: Iterate[Local]) -> bool:
-        """Beside a jump, or in the basin of an optimum that is known, and no lower."""
+    def has_ended(self, here: Iterate[Local], there: Iterate[Local]) -> bool:
+        """Decide whether the step is beside a jump, or in the basin of an optimum that is known,
+        and no lower."""
         if there.value > here.value and jumps(here.data, there.data, self.numbers):
             return True
         basin = self.numbers.basin
         return any(there.value >= J and np.abs(there.x - z).max() <= basin for z, J in self.optima)
 
     def _shares(self, step: Step) -> Array:
-        """Of each piece in the combination that holds a step."""
+        """Return the share of each piece in the combination that holds a step."""
         assert step.rows.hard is not None
         mu = np.where(step.rows.hard, 0.0, step.multipliers)
         return np.asarray(mu / max(float(mu.sum()), 1e-300))
 
-    def _combined(self, step: Step) -> Array:
+    def _combine(self, step: Step) -> Array:
         return np.asarray(self._shares(step) @ (self.size * step.rows.slopes))
 
 
-def _restored(z: Array, constraints: Constraints, options: PiecesOptions) -> Array | None:
+def _restore(z: Array, constraints: Constraints, options: PiecesOptions) -> Array | None:
     """The point, moved to λ <= 0 by the least that its slopes require; None where that fails."""
     for _ in range(options.restorations):
         g, jacobian = constraints(z)

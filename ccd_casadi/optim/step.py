@@ -134,12 +134,13 @@ class Step:
 
     @property
     def size(self) -> float:
-        """|p|∞."""
+        """The size |p|∞."""
         return float(np.abs(self.change).max())
 
 
 class TrustRegionModel(ABC, Generic[Data]):
-    """What is minimised over the box `low` <= x <= `high`, and how its curvature is learnt.
+    """The model of a trust-region method: what is minimised over `low` <= x <= `high`, and how its
+    curvature is learnt.
 
     Attributes
     ----------
@@ -173,15 +174,15 @@ class TrustRegionModel(ABC, Generic[Data]):
 
     @abstractmethod
     def rows(self, here: Iterate[Data], radius: float) -> Rows:
-        """What a step of this radius has to keep."""
+        """Return the rows that a step of this radius has to keep."""
 
-    def learnt(
+    def learn(
         self, H: Array, here: Iterate[Data], there: Iterate[Data], step: Step, radius: float
     ) -> Array:
         """The Hessian (n, n) of f, or of the Lagrangian where rows have none, after a trial."""
         return H
 
-    def ended(self, here: Iterate[Data], there: Iterate[Data]) -> bool:
+    def has_ended(self, here: Iterate[Data], there: Iterate[Data]) -> bool:
         """Whether a trial shows that further steps are of no use."""
         return False
 

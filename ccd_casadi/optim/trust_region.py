@@ -48,7 +48,7 @@ class RadiusOptions:
 
 @dataclass(frozen=True)
 class Radius:
-    """How far a step may go in each variable.
+    """The radius of the trust region: how far a step may go in each variable.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Radius:
         return replace(self, value=min(factor * self.value, self.largest), steady=0)
 
     def after(self, gained: float, step: Step) -> "Radius":
-        """What a step of this predicted gain leaves of it."""
+        """Update the radius after a step of this predicted gain."""
         options = self.options
         if gained > options.good * step.predicted:
             value = min(max(self.value, options.grow * step.size), self.largest)
@@ -152,21 +152,21 @@ def minimise(
         evaluations += 1
         gained = _gain(here, there, step.penalty)
         if gained < radius.options.good * step.predicted and there is not None and model.corrected:
-            change = _corrected(model, here, there, step, H, radius.value)
+            change = _correct(model, here, there, step, H, radius.value)
             other = None if change is None else model.at(here.x + change)
             evaluations += change is not None
             if _gain(here, other, step.penalty) > gained:
                 there, gained = other, _gain(here, other, step.penalty)
         radius = radius.after(gained, step)
         if there is not None:
-            if model.ended(here, there):
+            if model.has_ended(here, there):
                 return Minimum(there if gained > 0.0 else here, radius, evaluations, True)
-            H = model.learnt(H, here, there, step, radius.value)
+            H = model.learn(H, here, there, step, radius.value)
             here = there if gained > 0.0 else here
     return Minimum(here, radius, evaluations, False)
 
 
-def _corrected(
+def _correct(
     model: TrustRegionModel[Data],
     here: Iterate[Data],
     there: Iterate[Data],
@@ -187,7 +187,7 @@ def _corrected(
 
 
 def _gain(here: Iterate[Data], there: Iterate[Data] | None, penalty: float) -> float:
-    """By how much the merit falls; -∞ where there is nothing."""
+    """Compute by how much the merit falls; -∞ where there is nothing."""
     if there is None:
         return -np.inf
     return here.value - there.value + penalty * (here.violation - there.violation)

@@ -26,7 +26,7 @@ from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import Slopes
 from ccd_casadi.plants.first_order import first_order
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered
+from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, number_modes
 from ccd_casadi.support.arrays import Array
 
 
@@ -73,7 +73,7 @@ def as_written(
         return system.wiring.around(system_of)
     lam, shapes, rigid = natural_modes(system.K, system.M, rigid_modes)
     own = np.zeros(len(lam))
-    single = numbered(shapes, rigid)[: len(modes)]
+    single = number_modes(shapes, rigid)[: len(modes)]
     own[single] = list(modes)[: len(single)]
     pushes = system.M @ shapes
     ratio = (1.0 + shift) * (1.0 + own)

@@ -18,7 +18,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import raised_words
 
 
-def remembered(
+def remember(
     mechanics: Callable[[tuple[float, ...], bool], Mechanics],
     derivatives: bool = True,
     *,
@@ -105,7 +105,9 @@ def user_plant(
             raise  # it was traced, and is no plant
         try:
             numeric.values(middle)
-        except Exception as of_numbers:  # it takes none either: what its own lines raised is told
+        except (
+            Exception
+        ) as of_numbers:  # it takes none either: what its own lines raised is reported
             own = isinstance(of_numbers, PlantError) or not isinstance(error, PlantError)
             raise (of_numbers if own else error) from None
         return numeric.plant(f"{type(error).__name__}: {error}")
@@ -155,7 +157,8 @@ def _at_theta(error: UserError, names: Sequence[str], theta: Sequence[float]) ->
 
 
 class _Values:
-    """What a model returns at one θ, as arrays when they are asked for; `scalars` are f and λ."""
+    """The values that a model returns at one θ, as arrays when they are read; `scalars` are f and
+    λ."""
 
     def __init__(self, result: Mapping[str, Any]) -> None:
         self._matrices, self._ratio, scalars = model_parts(result, ca.DM)
@@ -187,7 +190,7 @@ class DifferencedModel:
 
     @cached_property
     def _read(self) -> Callable[[tuple[float, ...]], _Values]:
-        """What the model returns; the last ones are kept."""
+        """The function that evaluates the model; its last values are kept."""
 
         @lru_cache(maxsize=self.differences.values_kept)
         def read(theta: tuple[float, ...]) -> _Values:
@@ -273,7 +276,8 @@ class DifferencedModel:
                    default=0.0)  # fmt: skip
 
     def doubt(self, theta: Sequence[float] | Array) -> str:
-        """Which derivative is wrong at θ, and the usual cause; empty where both formulas agree."""
+        """Name the derivative that is wrong at θ, and the usual cause; empty where both formulas
+        agree."""
         return self._disagreement(theta, 0.0)
 
     def _disagreement(self, theta: Sequence[float] | Array, leap: float) -> str:
@@ -299,8 +303,8 @@ class DifferencedModel:
     def _gaps(
         self, theta: Sequence[float] | Array
     ) -> Iterator[tuple[int, int, float, float, float]]:
-        """Of every matrix and parameter by number: how far both formulas differ over the box, the
-        matrix's largest derivative over the box, and its size.
+        """Yield for every matrix and parameter by number: how far both formulas differ over the
+        box, the matrix's largest derivative over the box, and its size.
 
         Nothing is called again: the coarse formula uses the fine one's points.
         """

@@ -186,7 +186,8 @@ class Krylov:
 def krylov_spaces(
     pencil: Pencil, start: Array, without: Array, options: KrylovOptions
 ) -> Iterator[Krylov]:
-    """Those from `start` (n, b), each a block larger, M-orthogonal to `without` (n, r).
+    """Yield the Krylov spaces from `start` (n, b), each a block larger, M-orthogonal to `without`
+    (n, r).
 
     Each block is orthogonalised against all before it: one product with M and one solution a block
     are all.
@@ -292,7 +293,7 @@ def build_resolvent(
     M_start = pencil.mass(start)
 
     def of(space: Krylov, value: float) -> Array:
-        """x = Vy."""
+        """Compute x = Vy in a space."""
         operator = np.eye(len(space.T)) - (value + pencil.shift) * space.T
         return np.asarray(np.linalg.solve(operator, space.V.T @ M_start))
 

@@ -107,8 +107,8 @@ class FirstOrderPlant:
 
     @property
     def pushed(self) -> Array:
-        """Where forces move the sensors (p, m): a free body and an integrator as they go on, at
-        rest what rests; of what goes away by itself first, C Aⁿ B."""
+        """The displacements of the sensors by forces (p, m): a free body and an integrator as they
+        go on, at rest what rests; of what goes away by itself first, C Aⁿ B."""
         A, B, C = self.system.A, self.system.B, self.system.C
         if not (self.rates.real < 0.0).all():
             return self.leading[1]
@@ -117,7 +117,7 @@ class FirstOrderPlant:
             return C[:, :n] @ B[n : 2 * n]
         return C[:, :r] @ B[:r] if r else -C @ np.linalg.solve(A, B)
 
-    def suspended(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
+    def suspend(self, omega: float, damping_ratio: float) -> "FirstOrderPlant":
         """The same with free bodies held by springs of ω in rad/s, or integrators driven away with
         ω: a controller cannot cancel these. Raises PlantError where it has both, whose states at
         rest are not one alone."""
@@ -156,11 +156,11 @@ class FirstOrderPlant:
 
     @property
     def _near(self) -> np.ndarray:
-        """Which poles (r, r) are one."""
+        """Whether two poles (r, r) are one."""
         return np.abs(self.rates - self.rates[:, None]) <= 1e-9 * np.abs(self.rates)
 
-    def driven(self, gain: float) -> "FirstOrderPlant":
-        """With B times a factor."""
+    def scale_input(self, gain: float) -> "FirstOrderPlant":
+        """Multiply B by a factor."""
         slopes = self.slopes._replace(dB=gain * self.slopes.dB)
         leading = self.leading[0], gain * self.leading[1]
         system = replace(self.system, B=gain * self.system.B)
@@ -347,17 +347,17 @@ def _at_rest(
     pairing = rows @ columns
     if np.linalg.cond(pairing) > 1e9:
         words = (
-            "A has three integrators in a row, or poles so near 0 that they cannot be told apart"
+            "A has three integrators in a row, or poles so near 0 that they cannot be distinguished"
         )
         raise PlantError(f"{words}; give all others a rate, or use mass, damping and stiffness")
     rows = np.linalg.solve(pairing, rows)
-    given, kept = _chosen(columns.T)
+    given, kept = _choose(columns.T)
     T = np.hstack([columns, np.eye(n)[:, kept] - columns @ rows[:, kept]])
     parted = np.eye(n)[kept] - columns[kept] @ np.linalg.solve(columns[given], np.eye(n)[given])
     return T, np.vstack([rows, parted]), kept, len(bodies), len(single)
 
 
-def _chosen(rows: Array) -> tuple[np.ndarray, np.ndarray]:
+def _choose(rows: Array) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of columns in which rows (r, n) are best known, and of the others."""
     order = scipy.linalg.qr(rows, mode="r", pivoting=True)[1]
     return order[: len(rows)], np.sort(order[len(rows) :])
@@ -367,7 +367,7 @@ def _null(A: Array, count: int) -> Array:
     """x (n, count) of A x = 0: some of its entries are chosen, the others are solved for."""
     n = len(A)
     free = np.sort(scipy.linalg.qr(A, mode="r", pivoting=True)[1][n - count :])
-    bound, rows = np.delete(np.arange(n), free), np.sort(_chosen(np.delete(A, free, axis=1).T)[0])
+    bound, rows = np.delete(np.arange(n), free), np.sort(_choose(np.delete(A, free, axis=1).T)[0])
     x = np.zeros((n, count))
     x[free] = np.eye(count)
     x[bound] = -np.linalg.solve(A[np.ix_(rows, bound)], A[np.ix_(rows, free)])

@@ -87,7 +87,7 @@ def with_fixed(
     free, domain = ca.MX.sym("theta", len(place)), plant.domain
     known: dict[str, Any] = {**fixed, **dict(zip(names, ca.vertsplit(free), strict=True))}
     theta = ca.vertcat(*(known[name] for name in plant.names))
-    return reparametrised(
+    return reparametrise(
         plant, of, own,
         names=tuple(names),
         hardware=ca.Function("hardware", [free], plant.hardware.call([theta])),
@@ -95,7 +95,7 @@ def with_fixed(
     )  # fmt: skip
 
 
-def reparametrised(
+def reparametrise(
     plant: Plant,
     of: Callable[[Evaluate], Evaluate],
     own: Callable[[Sequence[float]], tuple[float, ...]],
@@ -172,7 +172,7 @@ def with_wiring(plant: Plant, wiring: Wiring) -> Plant:
 
         return at
 
-    return reparametrised(
+    return reparametrise(
         plant, of, lambda theta: tuple(map(float, theta)),
         inputs=plant.inputs + more_u * m, outputs=plant.outputs + more_y * p,
         notes=lambda theta: (*plant.notes(theta), wiring.words),

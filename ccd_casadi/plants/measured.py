@@ -114,8 +114,8 @@ class MeasuredResponse:
 
     @property
     def derivative(self) -> str:
-        """Of which time derivative of the displacement its first lines are: their slope and angle
-        agree; empty where of none."""
+        """The time derivative of the displacement that its first lines are, in words: their slope
+        and angle agree; empty where of none."""
         order = round(-self._fall)
         angle = float(np.angle((self.matrix[0] * (-1j) ** order).sum()))
         most = self.options.derivative_gap
@@ -142,7 +142,7 @@ class MeasuredResponse:
 
     @property
     def antiresonances(self) -> np.ndarray:
-        """Those of its dips, the deepest first."""
+        """The antiresonances among its dips, the deepest first."""
         return self._extremes(-1.0)
 
     def _extremes(self, sign: float) -> np.ndarray:
@@ -159,8 +159,8 @@ class MeasuredResponse:
         return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
 
     def rise(self, to_hz: float) -> Rise:
-        """By how much the angle of det G rises up to `to_hz`, more than that of a stable G of this
-        size: each unstable pole there adds half a turn."""
+        """Compute by how much the angle of det G rises up to `to_hz`, more than that of a stable G
+        of this size: each unstable pole there adds half a turn."""
         used = self.hz <= to_hz
         many = max(3, int(np.searchsorted(self.hz, self.options.first_lines * self.hz[0])))
         if used.sum() < many or self.matrix.shape[1] != self.matrix.shape[2]:
@@ -187,7 +187,8 @@ class MeasuredResponse:
 
     @cached_property
     def followed(self) -> "MeasuredResponse":
-        """With three decades more below the first line, where it turns into its asymptote."""
+        """The response with three decades more below the first line, where it turns into its
+        asymptote."""
         hz, first = self.hz, self.matrix[0]
         decades = self.options.decades_below
         count = self.options.per_decade * decades + 1

@@ -22,7 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import UNWIRED, Slopes, Wiring
 from ccd_casadi.plants.first_order import FirstOrderPlant, first_order
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered, placed
+from ccd_casadi.plants.rigid_modes import driven_and_measured, embed, natural_modes, number_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -48,7 +48,7 @@ class ModalOptions:
 
 @dataclass(frozen=True)
 class Suspension:
-    """Where a synthesis puts the rigid-body poles.
+    """The soft suspension by which a synthesis moves the rigid-body poles.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class ModalPlant:
 
     @property
     def driven_away(self) -> np.ndarray:
-        """Which modes (n,) have a negative stiffness: K drives them away."""
+        """Whether each mode (n,) has a negative stiffness: K drives it away."""
         return np.asarray(np.diag(self.K) < 0.0)
 
     @property
@@ -151,11 +151,11 @@ class ModalPlant:
         """The flexible modes in the order of their numbers, see `numbered`."""
         if self.states is not None:
             return self.states.modes().resonances
-        return numbered(self.modes, self.rigid)
+        return number_modes(self.modes, self.rigid)
 
-    def driven(self, gain: float) -> "ModalPlant":
-        """With B times a factor."""
-        states = self.states and self.states.driven(gain)
+    def scale_input(self, gain: float) -> "ModalPlant":
+        """Multiply B by a factor."""
+        states = self.states and self.states.scale_input(gain)
         return replace(self, B=gain * self.B, dB=gain * self.dB, states=states)
 
     @property
@@ -204,10 +204,10 @@ def modal_plant(
         return _of_states(system, suspension, perturbation)
     lam, modes, rigid = natural_modes(system.K, system.M, suspension.rigid_modes)
     w_r = 2.0 * np.pi * suspension.frequency_hz
-    modes = _aligned(modes, lam, system.C, options.equal_outputs)
+    modes = _align(modes, lam, system.C, options.equal_outputs)
     root, driven_away = np.sqrt(np.abs(lam)), lam < 0.0
     own = np.zeros(rigid.size)
-    shifted = numbered(modes, rigid)[: len(perturbation.modes)]
+    shifted = number_modes(modes, rigid)[: len(perturbation.modes)]
     own[shifted] = perturbation.modes[: len(shifted)]
     ratio = (1.0 + perturbation.shift) * (1.0 + own)
     h = np.where(rigid, w_r**2, ratio**2 * lam)
@@ -256,7 +256,7 @@ def _of_states(system: Mechanics, held: Suspension, off: Perturbation) -> ModalP
     states = first_order(-system.K, system.B, system.C, Slopes(-dK, dB, dC))
     states = states.off(off.shift, off.damping, off.modes, off.lost)
     if held.frequency_hz:
-        states = states.suspended(2.0 * np.pi * held.frequency_hz, held.damping_ratio)
+        states = states.suspend(2.0 * np.pi * held.frequency_hz, held.damping_ratio)
     k, d, B, C, rigid, _ = states.modes()
     n, none = len(k), np.zeros((len(dK), len(k), len(k)))
     if not n:
@@ -290,7 +290,7 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     if count == own.size:
         return modal
     kept = np.setdiff1d(np.arange(len(modal.K)), own[count:])
-    T, back = placed(T, own, kept), placed(back.T, own, kept).T
+    T, back = embed(T, own, kept), embed(back.T, own, kept).T
     both = {name: back @ getattr(modal, name) @ T for name in ("K", "D", "dM", "dK", "dD")}
     drive = {name: back @ getattr(modal, name) for name in ("B", "dB")}
     shown = {name: getattr(modal, name) @ T for name in ("C", "dC", "modes")}
@@ -334,7 +334,7 @@ def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()
     raise PlantError(f"{where} {words}, or return damping_ratio, such as 0.005")
 
 
-def _aligned(modes: Array, lam: Array, C: Array, equal: float) -> Array:
+def _align(modes: Array, lam: Array, C: Array, equal: float) -> Array:
     """Rotate modes of one frequency so that what the sensors do not see stands alone.
 
     Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs

@@ -34,7 +34,7 @@ class PlantOptions:
     largest_entry: float = 1e100  # of any matrix or derivative, SI: its square is still a double
 
 
-def widened(model: ModelFunction) -> ModelFunction:
+def widen(model: ModelFunction) -> ModelFunction:
     """Put a model's disturbance beside its input, its performance below its output.
 
     Parameters
@@ -90,7 +90,7 @@ def model_parts(
     if ("damping" in result) == ("damping_ratio" in result):
         raise PlantError("the plant model must return either damping or damping_ratio; give one")
     M, K, B, C = (
-        _converted(kind, key, result[key]) for key in ("mass", "stiffness", "input", "output")
+        _convert(kind, key, result[key]) for key in ("mass", "stiffness", "input", "output")
     )
     n = M.shape[0]
     few = options.most_channels
@@ -101,7 +101,7 @@ def model_parts(
             words = f"at most {most} are taken; reduce it to what matters (its first modes)"
             raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
-    ports = {key: _converted(kind, key, result[key]) for key in PORTS if key in result}
+    ports = {key: _convert(kind, key, result[key]) for key in PORTS if key in result}
     _check_shapes(M, D, K, B, C, ports, first_order)
     ratio = _damping_ratio(result.get("damping_ratio"))
     for key, value in constraints.items():
@@ -109,7 +109,7 @@ def model_parts(
             words = "is a comparison; return a number"
             raise PlantError(f"constraint {key} {words}: h - 1.2 for h < 1.2, met where <= 0")
     given = {"hardware_cost": result["hardware_cost"], **constraints}
-    scalars = {key: _converted(kind, key, value) for key, value in given.items()}
+    scalars = {key: _convert(kind, key, value) for key, value in given.items()}
     for key, value in scalars.items():
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
@@ -131,7 +131,7 @@ def _of_mechanics(result: Mapping[str, Any]) -> dict[str, Any]:
         raise PlantError(f"the plant model returns {', '.join(given)}; add {', '.join(missing)}")
     kinds = [ca.SX if isinstance(value, ca.SX) else ca.DM for value in given.values()]
     kind = ca.SX if ca.SX in kinds else ca.DM
-    A, *_ = parts = [_converted(kind, key, value) for key, value in given.items()]
+    A, *_ = parts = [_convert(kind, key, value) for key, value in given.items()]
     if A.shape[0] != A.shape[1]:
         raise PlantError(f"A is {A.shape}; make it square, a row a state")
     if "D" in given and not kind(parts[-1]).is_zero():
@@ -168,7 +168,7 @@ def _damping_ratio(value: Any) -> float | None:
     return ratio
 
 
-def _converted(kind: Any, key: str, value: object) -> Any:
+def _convert(kind: Any, key: str, value: object) -> Any:
     if value is None or isinstance(value, str | Mapping):
         what = "None" if value is None else f"a {type(value).__name__}"
         raise PlantError(f"{key} is {what}; return numbers")

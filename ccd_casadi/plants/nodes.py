@@ -16,7 +16,7 @@ def in_axes(
     """Weights of nodes (N, m) combined to those of axes, and the slopes.
 
     `motions` (N, c) are those of the nodes, of which the first `quiet` are left alone. Raises
-    PlantError where the points do not tell them apart.
+    PlantError where the points do not separate them.
     """
     A, dA = W.T @ motions, dW.transpose(0, 2, 1) @ motions + W.T @ dmotions
     Q, R = np.linalg.qr(A)
@@ -37,7 +37,7 @@ def in_axes(
 def at_reference(W: Array, dW: Array, nodes: Array, reference: Array) -> tuple[Array, Array]:
     """Weights of nodes (N, m) combined to those of three or four points (p, 2), and the slopes.
 
-    V has as many columns as there are points. Raises PlantError where W does not tell them apart.
+    V has as many columns as there are points. Raises PlantError where W does not separate them.
     """
     here, there = (
         np.column_stack([np.ones(len(points)), points, points.prod(axis=1)])[:, : len(reference)]
@@ -121,7 +121,7 @@ class Positions:
                     self.constant[i, j] = value
 
     def at(self, theta: Array) -> Array:
-        """At θ, (m, d)."""
+        """Return the positions at θ, (m, d)."""
         return np.asarray(self.constant + self.slope @ theta)
 
 
@@ -157,7 +157,7 @@ class NodeInterpolation:
         return np.concatenate([kernel, power]) @ self._inverse, slopes / self.size
 
     def left_out(self, values: Array, points: Array) -> float:
-        """How far fields (n, N) are from what the other nodes say, over their largest.
+        """Compute how far fields (n, N) are from what the other nodes predict, over their largest.
 
         At the inner nodes nearest to points (m, d): nodes that are far away say nothing of these,
         and beyond an edge nothing is interpolated.

@@ -70,7 +70,7 @@ class DirectionOptions:
 
 @dataclass(frozen=True)
 class Rise:
-    """Of an angle above that of a stable G of this size.
+    """The rise of an angle above that of a stable G of this size.
 
     `half_turns`, from and to Hz, and the first and last Hz between which lines in it are too far
     apart to show which way it turns: NaN where none are.
@@ -89,7 +89,7 @@ def rise_of(hz: Array, F: np.ndarray, options: DirectionOptions = DirectionOptio
     """
     if not F.all():
         return Rise(0.0, np.nan, np.nan)
-    places, turns, angle, least = _followed(hz, F, options)
+    places, turns, angle, least = _follow(hz, F, options)
     found, first, last = _largest_rise(angle - least, options.lasting)
     low, high = (float(at) for at in np.exp(places[[first, last]]))
     apart = (np.abs(turns) > options.coarse) & (hz[1:] >= low) & (hz[:-1] <= high)
@@ -98,7 +98,7 @@ def rise_of(hz: Array, F: np.ndarray, options: DirectionOptions = DirectionOptio
     return Rise(found, low, high, *ends)
 
 
-def _followed(
+def _follow(
     hz: Array, F: np.ndarray, options: DirectionOptions
 ) -> tuple[Array, Array, Array, Array]:
     """Places over ln f, the turns from line to line, and at the places the angle and the least."""
@@ -111,12 +111,12 @@ def _followed(
 
 
 def _sharp_fall(turns: Array, options: DirectionOptions) -> Array:
-    """With every turn that is unclear as a fall."""
+    """Count every turn that is unclear as a fall."""
     return np.where(np.abs(turns) > options.unclear, -np.abs(turns), turns)
 
 
 def _largest_rise(above: Array, lasting: int) -> tuple[float, int, int]:
-    """In half turns, and the places from which and at which it is reached."""
+    """Find the largest rise in half turns, and the places from which and at which it is reached."""
     windows = np.lib.stride_tricks.sliding_window_view(above, lasting)
     before, after = windows.max(axis=1), windows.min(axis=1)
     rises = after[lasting:] - np.minimum.accumulate(before)[:-lasting]
@@ -133,14 +133,14 @@ def poles_at_peaks(
     """
     for peak in peaks.tolist():
         entry = np.unravel_index(np.abs(G[peak]).argmax(), G[peak].shape)
-        fits = [_fitted(hz, G[(slice(None), *entry)], peak, many, options)
+        fits = [_fit(hz, G[(slice(None), *entry)], peak, many, options)
                 for many in options.beside]  # fmt: skip
         good = [fit for fit in fits if fit is not None]
         if good:
             yield float(hz[peak]), min(good)[1] < 0.0
 
 
-def _fitted(
+def _fit(
     hz: Array, G: np.ndarray, peak: int, many: int, options: DirectionOptions
 ) -> tuple[float, float] | None:
     """Misfit and Im p of the pole at a peak; None where it is not sure."""
@@ -186,7 +186,7 @@ def turned_words(
     F = np.linalg.det(G)
     if not F.all():
         return ""
-    places, turns, angle, least = _followed(hz, F, options)
+    places, turns, angle, least = _follow(hz, F, options)
     turned = np.interp(places, np.log(hz), np.append(0.0, np.cumsum(_sharp_fall(-turns, options))))
     own, first, last = _largest_rise(angle - least, options.compared)
     allowed = unstable_poles + options.risen if unstable_poles else options.turned

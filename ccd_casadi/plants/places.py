@@ -3,7 +3,7 @@
 The inputs of the plant below are unit forces at nodes p_k, columns b_k: a node moves by b_kᵀ x.
 Between nodes b is interpolated (`nodes`), and a mass m at p adds m b(p) b(p)ᵀ to M. Frequencies,
 shapes and inertia move with it, exactly within the coordinates of the plant: how many modes these
-must be is told by its references.
+must be is identified by its references.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ import scipy
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE, ModeShape, ModeShapes
-from ccd_casadi.plants.fixed_parameters import reparametrised
+from ccd_casadi.plants.fixed_parameters import reparametrise
 from ccd_casadi.plants.nodes import (
     NodeInterpolation,
     Position,
@@ -35,7 +35,7 @@ from ccd_casadi.support.text import HZ
 
 @dataclass(frozen=True)
 class Places:
-    """Where forces act and sensors read, and with which masses.
+    """The places where forces act and sensors read, and their masses.
 
     With `axes` all forces act, and all sensors read, together along the motions of a rigid body
     normal to the nodes, 1, x, y, in directions of length 1: the number of inputs and outputs is
@@ -94,7 +94,7 @@ class Places:
         return names_in((*self.actuators, *self.sensors, self.present))
 
 
-def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
+def place_ports(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     """Move a plant's forces and sensors to their places.
 
     Parameters
@@ -172,7 +172,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
     f += places.actuator_cost * (ca.sum1(x[there]) if there else len(places.actuators))
     rules = _rules(evaluate, x)
-    return reparametrised(
+    return reparametrise(
         plant,
         of,
         below,

@@ -160,7 +160,8 @@ class Plant:
 
     @property
     def between(self) -> str:
-        """Where forces act and what they move, in words; at a sensor the position itself counts."""
+        """The place where forces act and what they move, in words; at a sensor the position itself
+        counts."""
         acts = "of a force at `disturbance`" if "disturbance" in self.ports else "of an actuator's"
         return f"{acts}, seen at {'`performance`' if 'performance' in self.ports else 'the sensor'}"
 

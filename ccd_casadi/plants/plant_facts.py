@@ -44,7 +44,7 @@ class PlantMode:
 
 @dataclass(frozen=True)
 class Zero:
-    """A transmission zero.
+    """A transmission zero of a plant.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Zero:
 
 @dataclass(frozen=True)
 class PlantFacts:
-    """What limits a loop on a plant at one θ.
+    """The facts that limit a loop on a plant at one θ.
 
     σ_r is the r-th singular value, r the number of rigid-body modes where there are fewer of them
     than inputs and outputs: a motion on a spring needs no force at low frequency.

@@ -72,7 +72,7 @@ TWO_MASS = Model(two_mass_plant, theta=("m1", "m2"), sound=True, annotated=True)
 
 
 @cache
-def _offered() -> dict[str, EntryPoint]:
+def _offer() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
@@ -84,7 +84,7 @@ def model_names() -> list[str]:
     list of str
         Sorted.
     """
-    return sorted({"two_mass", *extensions.declared("plants"), *_offered()})
+    return sorted({"two_mass", *extensions.collect_declared("plants"), *_offer()})
 
 
 @cache
@@ -104,7 +104,7 @@ def model_named(name: str | None) -> Model | None:
         return TWO_MASS if name else None
     if place := extensions.find("plants", name):
         return cast(Model, extensions.load(place))
-    if name in extensions.SHIPPED["plants"] or name not in _offered():
+    if name in extensions.SHIPPED["plants"] or name not in _offer():
         return None
-    found = _offered()[name].load()
+    found = _offer()[name].load()
     return found if isinstance(found, Model) else Model(found)

@@ -27,7 +27,7 @@ from ccd_casadi.plants.table_columns import (
     rate_order,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError, described, require
+from ccd_casadi.support.errors import UserError, describe, require
 from ccd_casadi.support.json_files import mat_variables
 
 SUFFIXES = (".uff", ".unv", ".uf", ".bunv")
@@ -72,7 +72,7 @@ def columns_of_universal(
         sets = [file.read_sets(i) for i in at]
         units = [file.read_sets(i) for i, kind in enumerate(kinds) if kind == 164]
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        raise UserError(f"{path}: is not a readable universal file: {described(error)}") from None
+        raise UserError(f"{path}: is not a readable universal file: {describe(error)}") from None
     found = [one for one in sets if int(one["func_type"]) == codes.response_function]
     if len(found) != 1:
         other = [FUNCTIONS.get(int(one["func_type"]), "other functions") for one in sets]
@@ -116,7 +116,7 @@ def _label(one: Mapping[str, Any], of: str) -> str:
 
 
 def _place(one: Mapping[str, Any]) -> str:
-    """Where a response was measured, as its file has it."""
+    """Describe where a response was measured, as its file has it."""
     ends = [f"{one[f'{of}_node']}:{int(one[f'{of}_dir']):+d}" for of in ("rsp", "ref")]
     return f"node and direction {ends[0]} over {ends[1]}"
 
@@ -284,7 +284,7 @@ def _of_coherence(
 def _quantities(
     path: Path, columns: Sequence[TableColumn]
 ) -> Iterator[tuple[str, tuple[TableColumn, float]]]:
-    """Each quantity with its column and the factor to SI; -1 of decibels."""
+    """Yield each quantity with its column and the factor to SI; -1 of decibels."""
     seen: dict[str, str] = {}
     for column in columns:
         found = meaning_of(column.name)

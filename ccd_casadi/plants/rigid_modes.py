@@ -92,7 +92,7 @@ def natural_modes(
     return np.append(np.zeros(count), lam), modes, np.arange(len(K)) < count
 
 
-def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
+def number_modes(modes: Array, rigid: np.ndarray) -> np.ndarray:
     """The flexible ones of modes (n, n), lowest first, in the order of their numbers.
 
     Where each coordinate of the model is a mode the model's order counts: what shifts a mode alone
@@ -147,7 +147,7 @@ def driven_and_measured(
     return T[:, :known], np.linalg.inv(T)[:known]
 
 
-def placed(T: Array, own: np.ndarray, kept: np.ndarray) -> Array:
+def embed(T: Array, own: np.ndarray, kept: np.ndarray) -> Array:
     """Embed a transformation of some coordinates into all of them.
 
     Parameters

@@ -11,7 +11,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.state_space import (
     StateSpace,
-    balanced,
+    balance_system,
     leading_term,
     state_scales,
     strictly_proper,
@@ -265,7 +265,7 @@ class ScaledPlant:
         return ForcedPlant.of(found, own.plant_si(), driven)
 
     def with_slopes_times(self, factors: Array) -> "ScaledPlant":
-        """With each of its derivatives times a factor (n_θ, 1, 1)."""
+        """Multiply each of its derivatives by a factor (n_θ, 1, 1)."""
         found = replace(self, dA=factors * self.dA, dB=factors * self.dB, dC=factors * self.dC)
         return found.forced_as(lambda own: own.with_slopes_times(factors))
 
@@ -309,9 +309,9 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
         No mode is both driven and measured.
     """
     if modal.wiring:
-        found = _scaled(modal, M_K, bare)
-        return replace(found, mechanics=_scaled(replace(modal, wiring=UNWIRED), M_K, True))
-    return _scaled(modal, M_K, bare)
+        found = _scale(modal, M_K, bare)
+        return replace(found, mechanics=_scale(replace(modal, wiring=UNWIRED), M_K, True))
+    return _scale(modal, M_K, bare)
 
 
 def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
@@ -332,7 +332,7 @@ def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
         Of these, in their unit of frequency, with what disturbing forces move beside it; without
         the grid, the gains and the channels.
     """
-    wide = _scaled(modal, M_K, True)
+    wide = _scale(modal, M_K, True)
     B, C = own.drives(modal.B)[0], own.readings(modal.C)[0]
     leading = 2, np.array([[np.linalg.norm(B) * np.linalg.norm(C)]])
     if (states := modal.states) is not None:
@@ -354,7 +354,7 @@ def scale_at_ports(modal: ModalPlant, M_K: float, own: OwnPorts) -> ScaledPlant:
     return replace(wide, B=B, C=C, dB=dB, dC=dC, mechanics=moved, counted=counted)
 
 
-def _scaled(modal: ModalPlant, M_K: float, bare: bool) -> ScaledPlant:
+def _scale(modal: ModalPlant, M_K: float, bare: bool) -> ScaledPlant:
     if modal.states is not None:
         return _scaled_states(modal, modal.states, M_K, bare)
     b = np.linalg.norm(modal.B, axis=1)
@@ -439,7 +439,7 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     if np.any(system.D):
         raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
     omega_0 = _unit_of_frequency(leading_term(system.A, system.B, system.C), M_K)
-    A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
+    A, B, C = balance_system(system.A / omega_0, system.B * (M_K / omega_0), system.C)
     grid, gain = _gains(A, B, C)
     poles = np.linalg.eigvals(system.A)
     natural = np.sort(np.abs(poles[poles.imag >= 0.0]))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.errors import UserError, describe
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.text_table import (
     READ,
@@ -85,7 +85,7 @@ def npz_arrays(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or described(error)
+        reason = getattr(error, "strerror", None) or describe(error)
         raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
@@ -125,7 +125,8 @@ def refuse_polynomials(path: Path, names: Iterable[str]) -> None:
 
 
 def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColumn]:
-    """Those that hold numbers, with the units that texts state; other texts are notes."""
+    """Find the columns that hold numbers, with the units that texts state; other texts are
+    notes."""
     refuse_polynomials(path, content)
     if {"m", "k"} <= {name.casefold() for name in content}:
         words = "M and K are the matrices of a model, not a response"

@@ -38,9 +38,9 @@ from ccd_casadi.reporting.facts import (
 )
 from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.limit_figures import binding_words
-from ccd_casadi.reporting.machine import loci, lumped, lumped_svg
+from ccd_casadi.reporting.machine import find_lumped, loci, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.support.text import HZ, counted, display_unit, number, template, with_unit
+from ccd_casadi.support.text import HZ, display_unit, number, plural, template, with_unit
 from surrogates.files import write_whole
 
 _change = partial(change_words, digits=1, none="unchanged")
@@ -50,7 +50,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
 
 @dataclass(frozen=True)
 class BriefOptions:
-    """What the brief asks of the design."""
+    """Numbers of the brief."""
 
     limits: int = 3  # at most
     risks: int = 3  # at most
@@ -101,7 +101,7 @@ def write_brief(run: FinishedRun, options: BriefOptions = BriefOptions()) -> lis
     page = run.folder / NAME
     write_whole(page, brief_html(run, options))
     pdf = page.with_suffix(".pdf")
-    return [page, *([pdf] if _printed(page, pdf, options) else [])]
+    return [page, *([pdf] if _print_page(page, pdf, options) else [])]
 
 
 def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
@@ -130,10 +130,10 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
 
 
 def _lead(run: FinishedRun) -> str:
-    """What was chosen and what it reaches, in words that need no other page."""
+    """Describe what was chosen and what it reaches, in words that need no other page."""
     result = run.result
     count = result.get("judge", {}).get("plants", 1)
-    plants = "on its model" if count == 1 else f"on every one of {counted(count, 'plant')}"
+    plants = "on its model" if count == 1 else f"on every one of {plural(count, 'plant')}"
     theta = theta_words({k: v for k, v in result.items() if k != "varies"})
     varies = theta_words({**result, "theta": {}, "fixed": {}})
     over = f", {varies}" if varies else ""
@@ -195,7 +195,7 @@ def bars(result: Mapping[str, Any]) -> Iterator[Bar]:
 
 
 def nearest(found: list[Bar], most: int) -> list[Bar]:
-    """Those with the least left, in their order; one that is not known counts as missed."""
+    """Select those with the least left, in their order; one that is not known counts as missed."""
     used = [-math.inf if math.isnan(bar.used) else -bar.used for bar in found]
     kept = sorted(sorted(range(len(found)), key=lambda i: used[i])[:most])
     return [found[i] for i in kept]
@@ -207,7 +207,7 @@ def _limits(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
 
 
 def evidence(result: Mapping[str, Any]) -> str:
-    """Who judged a design, and which of its requirements are proven."""
+    """Describe who judged a design, and which of its requirements are proven."""
     judge = result.get("judge", {})
     second = result.get("second_engine", {}).get("words", "")
     words = [f"An independent judge (NumPy, on the matrices as written): {judge.get('words', '')}"]
@@ -230,7 +230,7 @@ def _checks(result: Mapping[str, Any]) -> str:
 
 
 def _next(decided: Decision, result: Mapping[str, Any]) -> str:
-    """What to do after reading this page."""
+    """Describe what to do after reading this page."""
     deployed = "order" in result.get("verdict", {}).get("deployable", {})
     build = (
         [] if deployed or decided.refuses else ["ccd deploy, which writes the controller's code"]
@@ -239,7 +239,7 @@ def _next(decided: Decision, result: Mapping[str, Any]) -> str:
 
 
 def _reproduce(run: FinishedRun) -> str:
-    """Which version made this, of what, and the command that makes it again."""
+    """Describe which version made this, of what, and the command that makes it again."""
     result, value = run.result, FIGURES[run.result.get("minimise", "bandwidth")]
     versions, sampling = result.get("versions", {}), run.problem.sampling
     order = result.get("controller", {}).get("order")
@@ -270,7 +270,7 @@ def machines(run: FinishedRun) -> list[tuple[str, Markup]]:
         drawn = block.drawing if isinstance(block, c.Figure) else block
         return [(" and ".join(thetas), block_html(drawn, "machine"))]
     systems = {name: mechanics(plant, theta, derivatives=False) for name, theta in thetas.items()}
-    found = {name: lumped(system) for name, system in systems.items()}
+    found = {name: find_lumped(system) for name, system in systems.items()}
     if any(one is None for one in found.values()):
         return []
     most = max(float(abs(one.masses).max()) for one in found.values() if one is not None)
@@ -284,7 +284,7 @@ def machines(run: FinishedRun) -> list[tuple[str, Markup]]:
     ]
 
 
-def _printed(page: Path, pdf: Path, options: BriefOptions) -> bool:
+def _print_page(page: Path, pdf: Path, options: BriefOptions) -> bool:
     """Whether a browser has printed the page."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:

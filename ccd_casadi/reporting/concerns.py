@@ -19,7 +19,7 @@ LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 
 
 class ConcernKind(StrEnum):
-    """Why a decision is not an unconditional yes."""
+    """The reason why a decision is not an unconditional yes."""
 
     LINE_FAILED = "line_failed"
     LINE_WARNED = "line_warned"
@@ -81,7 +81,7 @@ def limited_move(result: Mapping[str, Any]) -> str:
 
 
 def limited_move_remedy(result: Mapping[str, Any]) -> str:
-    """What to change where `limited_move` has words."""
+    """Describe what to change where `limited_move` has words."""
     if _move(result).get("settles_unlimited", True):
         return "deploy with a larger --saturation, or a slower move"
     return "deploy with a slower move or a wider --window: it does not settle unlimited either"
@@ -119,8 +119,9 @@ def resonance_condition(
 def loop_concerns(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> list[Concern]:
-    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
-    and what is narrow or rings near the bandwidth, against the usual limits of the field.
+    """List what an engineer would object to in a loop that keeps the bounds of its case: its
+    margins, its step and what is narrow or rings near the bandwidth, against the usual limits of
+    the field.
 
     The step does not count where the case names the move that the stage makes.
     """
@@ -150,7 +151,8 @@ def loop_concerns(
 def line_concern(
     result: Mapping[str, Any], options: ConcernOptions = ConcernOptions()
 ) -> list[Concern]:
-    """What |S| of a measured response may reach between its lines; empty where that is little."""
+    """List what |S| of a measured response may reach between its lines; empty where that is
+    little."""
     reach = result.get("sensitivity_peak_between_lines")
     if reach is None or reach <= max(1.0, options.between_lines * result["sensitivity_peak"]):
         return []
@@ -163,7 +165,7 @@ def line_concern(
 def current_concern(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> list[Concern]:
-    """What a move needs beyond the peak current of its motor; empty where it is enough."""
+    """List what a move needs beyond the peak current of its motor; empty where it is enough."""
     move = result.get("move") or {}
     share = move.get("needed_share")
     if share is None or not share > 1.0 + options.slack:
@@ -213,8 +215,8 @@ def worst_state(result: Mapping[str, Any]) -> State:
     return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
 
 
-def unproven(result: Mapping[str, Any]) -> str | None:
-    """Why `survives` is neither passed nor warned; None where it is one of them."""
+def why_unproven(result: Mapping[str, Any]) -> str | None:
+    """Explain why `survives` is neither passed nor warned; None where it is one of them."""
     line = next((line for line in lines_of(result) if line.name == "survives"), None)
     if line is None or line.state != State.UNKNOWN:
         return None
@@ -274,8 +276,8 @@ def risks(
         if line.state == State.FAILED
     ]  # fmt: skip
     survives = result.get("verdict", {}).get("survives", {})
-    if unproven(result) is not None:
-        found.append(f"The [robust] set is {unproven(result)}.")
+    if why_unproven(result) is not None:
+        found.append(f"The [robust] set is {why_unproven(result)}.")
     elif survives.get("set") == "unproven":
         found.append("The bounds are kept on all plants that were drawn from the [robust] set, and "
                      "are not proven on all of it.")  # fmt: skip

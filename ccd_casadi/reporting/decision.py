@@ -20,7 +20,7 @@ from ccd_casadi.reporting.concerns import (
     lines_of,
     loop_concerns,
     resonance_condition,
-    unproven,
+    why_unproven,
 )
 
 NEXT = {  # what to do about a line that failed, or about what the decision names
@@ -39,7 +39,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
 
 
 class Build(StrEnum):
-    """What a decision says: every decision has one of these states.
+    """The state of a decision.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ def advice(result: Mapping[str, Any]) -> str:
 
 
 def _decide_loop(result: Mapping[str, Any]) -> Decision:
-    """Of a loop without a verdict: `tune` and baselines."""
+    """Decide on a loop without a verdict: `tune` and baselines."""
     if result.get("status", "verified") != "verified":
         return Decision(Build.NOT_VERIFIED, steps=("see why",))
     concerns = loop_concerns(result)
@@ -227,8 +227,8 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
 
 
 def _warning(line: Check) -> Concern:
-    """What a line that warned warns of: among its findings there are good ones too, and what is
-    known in part, as of a kink, is its first."""
+    """Return what a line that warned warns of: among its findings there are good ones too, and what
+    is known in part, as of a kink, is its first."""
     of = ConcernKind.MISPREDICTED if line.name == "predicted" else ConcernKind.LINE_WARNED
     known = [one for one in line.findings if one.reason in WARNINGS] or line.findings[:1]
     words = [one.words(line.figures) for one in known if one.reason is not Reason.QUOTED]
@@ -236,7 +236,7 @@ def _warning(line: Check) -> Concern:
 
 
 def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Concern]:
-    """What the line `survives` adds; nothing where it passed."""
+    """List what the line `survives` adds; nothing where it passed."""
     own = result["verdict"].get("survives", {}).get("set")
     if state == State.WARNED:
         if own == OwnSet.UNPROVEN:
@@ -249,13 +249,16 @@ def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Con
         return [Concern(ConcernKind.SMALL_ERRORS, "it does not survive small errors of its model")]
     if state == State.UNKNOWN:
         if own == OwnSet.SEARCHED:
-            return [Concern(ConcernKind.SET_SEARCHED, f"the [robust] set is {unproven(result)}")]
+            return [
+                Concern(ConcernKind.SET_SEARCHED, f"the [robust] set is {why_unproven(result)}")
+            ]
         return [Concern(ConcernKind.SURVIVAL_UNKNOWN, "what it survives is not known")]
     return []
 
 
 def _next_of_failed(name: str, result: Mapping[str, Any]) -> str:
-    """What to do about a line that failed; where a rate is not enough at this delay, the delay."""
+    """Describe what to do about a line that failed; where a rate is not enough at this delay, the
+    delay."""
     line = result["verdict"][name]
     if name == "survives":
         return _next_of_survival(line)
@@ -272,8 +275,8 @@ def _next_of_survival(line: Mapping[str, Any]) -> str:
 
 
 def _unstable_controller(result: Mapping[str, Any]) -> str:
-    """Why `survives` warns of a loop that keeps its [robust] set and small errors beyond it; empty
-    where it does not survive the latter."""
+    """Explain why `survives` warns of a loop that keeps its [robust] set and small errors beyond
+    it; empty where it does not survive the latter."""
     line = result["verdict"]["survives"]
     shift, least = line.get("stable_shift"), line.get("least_shift", 0.0)
     if shift is None or not (shift[0] <= -least and shift[1] >= least):

@@ -149,7 +149,7 @@ def _step(run: FinishedRun, found: Deployment) -> c.Figure:
 
 
 def _words(part: str, *known: Any) -> tuple[c.Words, ...]:
-    """Of a macro of `templates/deployment.txt`."""
+    """Render a macro of `templates/deployment.txt`."""
     return tuple(map(c.Words, paragraphs(f"deployment.{part}", *known)))
 
 

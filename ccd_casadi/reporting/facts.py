@@ -16,9 +16,9 @@ from ccd_casadi.plants.plant import hardware_slopes
 from ccd_casadi.support.terminal import plain
 from ccd_casadi.support.text import (
     HZ,
-    counted,
     display_unit,
     number,
+    plural,
     small_share,
     spoken,
     template,
@@ -205,7 +205,8 @@ def requirement_words(
 
 
 def requirement_place(one: Mapping[str, Any]) -> str:
-    """At which frequency and on which plant a requirement is nearest to its limit; may be empty."""
+    """Describe at which frequency and on which plant a requirement is nearest to its limit; may be
+    empty."""
     hz, plant = one["frequency_hz"], one["plant"]
     plant = plant.replace("resonance_shift", "resonances")
     return ", ".join(filter(None, ("" if hz is None else f"{number(hz, 4)} Hz", plant)))
@@ -246,7 +247,7 @@ def _text(part: str, *known: Any, **functions: Any) -> str:
     """Raises KeyError where something that it says is not known, as of a run of before."""
     name, macro = part.split(".")
     made = template(
-        f"templates/{name}.txt", HZ=HZ, number=number, with_unit=with_unit, counted=counted,
+        f"templates/{name}.txt", HZ=HZ, number=number, with_unit=with_unit, counted=plural,
         small_share=small_share, cost_words=cost_words, prediction_words=prediction_words,
         channel_words=channel_words, **functions,
     )  # fmt: skip
@@ -360,9 +361,9 @@ def _held_theta(
     *,
     binding: float = 1e-6,
 ) -> dict[str, float] | None:
-    """Where bounds and λ alone determine θ, df by each of them that is loosened by 1 of its
-    multiplier's unit. None where θ moves otherwise too: that takes second derivatives. A
-    constraint binds from a multiplier of `binding` times the largest on."""
+    """Compute df by each of bounds and λ that is loosened by 1 of its multiplier's unit, where they
+    alone determine θ. None where θ moves otherwise too: that takes second derivatives. A constraint
+    binds from a multiplier of `binding` times the largest on."""
     point, plant = [theta[name] for name in problem.names], plant_of(problem)
     width = np.subtract(problem.upper, problem.lower)
     df, dlam = (rows * width for rows in hardware_slopes(plant, point))
@@ -390,12 +391,13 @@ def _sentence(
     cost = step * held.get(name, 0.0)
     value = (-falls - problem.w1 * cost) / problem.w2
     v, changed = problem.figure, f"the cost by {number(cost, 3)} {problem.cost_unit}".rstrip()
-    moves = f"{v.symbol} changes by {v.shown(value, 3)}, {changed} ({in_J})"
+    moves = f"{v.symbol} changes by {v.format_value(value, 3)}, {changed} ({in_J})"
     return f"{words}. {loosened}: {moves}."
 
 
 def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
-    """What holds the design, a step that loosens it (in the multiplier's unit), that in words."""
+    """Describe what holds the design, a step that loosens it (in the multiplier's unit), and that
+    in words."""
     inner, (variable, _, end) = problem.inner, name.rpartition(" ")
     if name == "S_max":
         return f"The peak of S is at S_max = {inner.S_max:g}", 0.01, "Raising S_max by 1 %"

@@ -195,7 +195,7 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
             top = 3.5 * max(b.S_max, float(high))  # room for the words at its peak
             found["y_range"] = (0.5 * float(first.sizes[0, 0].min()), top)
             shape = (first.hz, first.bounds[0]) if b.required else None
-            found["forbidden"] = forbidden(b.S_max, b.S_low, b.low_hz, *ends, top, shape)
+            found["forbidden"] = forbidden_gains(b.S_max, b.S_low, b.low_hz, *ends, top, shape)
         return sensitivity_panel(curves, ends, b.S_max, at, label, **{**found, **more})
     if alone and first.bounded.required:
         found["forbidden"] = above(first.hz, first.bounds[i], found["y_range"][1])
@@ -238,7 +238,7 @@ def compliance_panel(view: LoopView) -> Panel:
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 
-def forbidden(
+def forbidden_gains(
     S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float,
     shape: tuple[Array, Array] | None = None,
 ) -> tuple[Area, ...]:  # fmt: skip
@@ -273,7 +273,8 @@ def forbidden(
 
 
 def above(hz: Array, bound: Array, top: float) -> tuple[Area, ...]:
-    """Where a gain may not be, over Hz: above a bound that is NaN where nothing is asked."""
+    """Return the areas that a gain may not enter, over Hz: above a bound that is NaN where nothing
+    is required."""
     required = np.isfinite(bound) & (bound < top)
     if not required.any():
         return ()

@@ -32,7 +32,7 @@ MOST = 12  # designs along the front that are drawn
 
 
 def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> c.Page:
-    """Make insight.html.
+    """Make the page insight.html.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def _limits(run: FinishedRun, rule: str) -> tuple[c.Block, ...]:
 def front_figure(
     problem: CoDesignProblem, front: Front, design: tuple[float, float, str]
 ) -> c.Figure:
-    """What J counts over hardware cost, and where each θ lies in its bounds along the curve.
+    """Draw what J counts over hardware cost, and where each θ lies in its bounds along the curve.
 
     `design` is (f, v in its shown unit, words) of the run's own optimum.
     """
@@ -128,8 +128,8 @@ def front_figure(
 
 
 def front_answer(problem: CoDesignProblem, front: Front, own: float | None = None) -> str:
-    """What the front says of weight against what J counts, in one sentence; with what the next
-    piece of hardware is worth at its ends and at the design whose hardware cost is `own`."""
+    """Describe in one sentence what the front shows of weight against what J counts; with what the
+    next piece of hardware is worth at its ends and at the design whose hardware cost is `own`."""
     good = [point for point in front.points if point.verified]
     cost, value = (np.array([getattr(point, name) for point in good], float)
                    for name in ("hardware_cost", "value"))  # fmt: skip
@@ -190,8 +190,8 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
 def table_responses(
     problem: CoDesignProblem, found: PostOptimal, *, rounding: float = 1e-9
 ) -> c.Bars:
-    """What the optimum becomes if a parameter of the case grows by 1 %, the most for J first, in
-    the units of the case file; of a parameter that is 0 per unit.
+    """Tabulate what the optimum becomes if a parameter of the case grows by 1 %, the most for J
+    first, in the units of the case file; of a parameter that is 0 per unit.
 
     A doubled parameter that moves θ by less than `rounding` of the box does not move it.
     """

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import FormulationRound
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, axis_label
-from ccd_casadi.inner_problem.objective import violated
+from ccd_casadi.inner_problem.objective import violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.sampling.store import Sample, SampleStore
@@ -212,7 +212,7 @@ def landscape_data(
         field = process.predict(thetas).reshape(count, count) / HZ
     forbidden = None
     if plant_of(problem).constraint_names:
-        bad = [bool(violated(problem, tuple(place))) for place in thetas]
+        bad = [bool(violations(problem, tuple(place))) for place in thetas]
         forbidden = np.array(bad).reshape(count, count)
     region = None
     if radius < 1.0:
@@ -264,7 +264,7 @@ def known_bandwidths(
 
 
 def caption_landscape(land: c.Landscape, best_hz: float) -> str:
-    """What the colours and the dots are, and what the field leaves out."""
+    """Describe what the colours and the dots are, and what the field leaves out."""
     field = land.bandwidth_hz
     inside = np.isfinite(field) & ~land.outside
     known = field[inside] if inside.any() else field
@@ -273,7 +273,7 @@ def caption_landscape(land: c.Landscape, best_hz: float) -> str:
 
 
 def caption_disagreement(process: GaussianProcess | None, truths: Truths) -> str:
-    """How far the surrogate's ω_b* is from the true one where it was not fitted to it."""
+    """Describe how far the surrogate's ω_b* is from the true one where it was not fitted to it."""
     if process is None:
         return ""
     unit = (truths.theta - process.lower) / (process.upper - process.lower)

@@ -19,7 +19,7 @@ from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import binding, gain_words, paragraph, paragraphs, theta_axes
 from ccd_casadi.reporting.gain_figures import gain_panels, over_hz, synthesised_loop, view_of
-from ccd_casadi.support.text import HZ, counted, display_unit, number, spoken
+from ccd_casadi.support.text import HZ, display_unit, number, plural, spoken
 from ccd_casadi.synthesis.closed_loop import measure
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def bandwidths_table(verified: "VerifiedStructured") -> c.Table:
     assert design.controller is not None
     sampling, plants = structured_of(problem).sampling, design.certificate.plants
     as_run = "continuous" if sampling is None else f"as sampled at {number(sampling.rate_hz)} Hz"
-    least = f"the least of {counted(len(plants), 'plant')} of the set, which J counts"
+    least = f"the least of {plural(len(plants), 'plant')} of the set, which J counts"
     rows = [(least, as_run, design.certificate.bandwidth),
             ("the model", as_run, plants[0].crossing)]  # fmt: skip
     if sampling is not None:
@@ -51,7 +51,7 @@ def bandwidths_table(verified: "VerifiedStructured") -> c.Table:
 
 
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
-    """What holds θ, and what the controller, with what loosening it would gain."""
+    """Describe what holds θ, and what the controller, with what loosening it would gain."""
     over_theta = binding(problem, {**result, "active": []})
     mu, kink = result["controller"]["multipliers"], result["kkt"].get("kink")
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
@@ -67,7 +67,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
             own, channel = kind_and_channel(name)
             if own == kind:
                 of = f" of channel {channel}" if channel else ""
-                worth = v.shown(0.01 * mu[name] * most, 3)
+                worth = v.format_value(0.01 * mu[name] * most, 3)
                 more = f"1 % more of it gives {worth} on this hardware"
                 over_kappa.append(f"{words}{of} binds; {more}.")
     ranges = [key.rpartition(" ") for key in result["controller"]["at_range"]]
@@ -77,7 +77,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
 
 
 def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[c.Block, ...]:
-    """What bounds every controller at θ, and what the set, hold and delay cost this structure."""
+    """Make the blocks on what bounds every controller at θ, and what the set, hold and delay cost
+    this structure."""
     costs, gap = result["costs"], result["gap"] or {}
     sampled = structured_of(problem).sampling is not None
 
@@ -86,7 +87,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
     loop, v = "sampled" if sampled else "continuous", problem.figure
     least = "" if v.larger_is_better else f", of the least {v.words}"
-    whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
+    whole = f"{plural(result['certificate']['plants'], 'plant')} of the set"
     bound = hz(gap.get("bandwidth_bound_hz"))
     rows = [
         ("no controller of any order exceeds", gap.get("plants", "the model"), loop, bound),
@@ -156,7 +157,7 @@ def table_limits(loop: LoopView) -> c.Table:
 
 
 def limit_sentences(loop: LoopView) -> list[str]:
-    """What holds ω_b, and what stands where S is largest."""
+    """Describe what holds ω_b, and what is largest where S is."""
     found = shares(loop, loop.bandwidth_hz)
     held = [(PARTS[i], found[i]) for i in np.argsort(found)[::-1]]
     top = max(

@@ -42,7 +42,7 @@ class Lumped:
     measured: tuple[int, ...]
 
 
-def lumped(system: Mechanics, *, small: float = 1e-9) -> Lumped | None:
+def find_lumped(system: Mechanics, *, small: float = 1e-9) -> Lumped | None:
     """Find the masses and springs that M and K consist of.
 
     M must be diagonal, K without a positive entry beside its diagonal or a negative row sum, and
@@ -114,15 +114,15 @@ def lumped_machine(
     -------
     Picture or Table
     """
-    found = lumped(system)
+    found = find_lumped(system)
     if found is None:
         return modes_table(modal)
     return Picture(lumped_svg(found, modal, reference or float(np.abs(found.masses).max())))
 
 
 def modes_table(modal: ModalPlant) -> Table:
-    """Of each mode: frequency, damping ratio, and the norms of what drives and measures it, as
-    shares of the largest of all modes."""
+    """Tabulate of each mode: frequency, damping ratio, and the norms of what drives and measures
+    it, as shares of the largest of all modes."""
     rows = []
     for mode in sorted(modes_of(modal), key=lambda mode: mode.frequency_hz):
         known = (f"{number(mode.frequency_hz, 4)}\u00a0Hz", f"{100.0 * mode.damping_ratio:.3g} %")
@@ -161,7 +161,7 @@ HEIGHT = 3.0  # inches of a row
 def glance(
     problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: Figure
 ) -> Chapter:
-    """Of a design on the plants that it is made for."""
+    """Make the chapter at a glance of a design, on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
     S_max = problem.inner.S_max
     names = ("an eigenvalue of L", "the others")

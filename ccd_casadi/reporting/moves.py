@@ -226,12 +226,12 @@ def _over(time: Array, m: Move, values: Array) -> Array:
 
 
 def _error(m: Move) -> Array:
-    """Of the moving output."""
+    """Return the error of the moving output."""
     return m.error if m.error.ndim == 1 else np.asarray(m.error[:, 0])
 
 
 def shown_until(found: Move) -> float:
-    """Where the figure of a move ends, s."""
+    """Return the time in s at which the figure of a move ends."""
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 

@@ -91,7 +91,7 @@ def _(item: CoDesignProblem) -> str:
         rows.append((name, unit or "–", *numbers))
     name = item.source.name
     table = Table(("θ", "unit", "lower", "upper", "start"), tuple(rows))
-    found = facts("problem", item, *kind_of(item).described())
+    found = facts("problem", item, *kind_of(item).describe())
     return _cell(Heading(f"A co-design problem: {name}"), table, Facts(tuple(found)))
 
 

@@ -24,7 +24,7 @@ SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 def robustness_page(
     run: FinishedRun, found: Study, seed: int, index: str = "", *, own: bool = True
 ) -> c.Page:
-    """Make robustness.html.
+    """Make the page robustness.html.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def _verdicts(first: FinishedRun, second: FinishedRun, names: tuple[str, str]) -
 
 
 def _case(first: FinishedRun, second: FinishedRun, names: tuple[str, str]) -> c.Words | c.Source:
-    """Which lines of the resolved cases differ, defaults included."""
+    """List which lines of the resolved cases differ, defaults included."""
     before, after = (_with_tables(run) for run in (first, second))
     differ = unified_diff(before, after, names[0], names[1], n=0, lineterm="")
     lines = [line for line in differ if not line.startswith("@@")]

@@ -12,12 +12,12 @@ from urllib.parse import quote
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page
 from ccd_casadi.drawing.paint import page_html, update_pages, write_page
-from ccd_casadi.reporting.concerns import lines_of, loop_concerns, unproven, worst_state
+from ccd_casadi.reporting.concerns import lines_of, loop_concerns, why_unproven, worst_state
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import columns, wrapped
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.terminal import columns, wrap
+from ccd_casadi.support.text import plural
 from surrogates.files import write_whole
 
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
@@ -36,7 +36,7 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     list of str
     """
     lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
-    return [wrapped(line, columns(sys.stdout)) for line in lines]
+    return [wrap(line, columns(sys.stdout)) for line in lines]
 
 
 def detail_lines(result: Mapping[str, Any]) -> list[str]:
@@ -77,7 +77,7 @@ def head_of(
     Head
     """
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
-    clean &= unproven(result) is None
+    clean &= why_unproven(result) is None
     badge = "bad" if not good else "good" if clean else "warn"
     own = bool(decision)
     decision = decision or advice(result)
@@ -128,13 +128,13 @@ def head_words(result: Mapping[str, Any]) -> str:
     )
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
-    if not warned and unproven(result) is not None:
-        return f"all that could be checked passed; survives: {unproven(result)}"
+    if not warned and why_unproven(result) is not None:
+        return f"all that could be checked passed; survives: {why_unproven(result)}"
     if not warned:
         count = len(loop_concerns(result))
         open_ = ", ".join(unknown)
         words = f"no check failed; unknown: {open_}" if open_ else "all checks passed"
-        return words + (f", with {counted(count, 'reservation')}" if count else "")
+        return words + (f", with {plural(count, 'reservation')}" if count else "")
     return f"with warnings: {', '.join(warned)}"
 
 
@@ -237,7 +237,7 @@ def write_index(folder: Path) -> None:
 
 
 def _pages(folder: Path) -> dict[Path, str]:
-    """What there is, and what it is; a folder with a run of its own is no deployment."""
+    """List the pages of a folder, with words; a folder with a run of its own is no deployment."""
     return {
         place: words
         for name, words in PAGES.items()

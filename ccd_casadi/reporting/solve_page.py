@@ -93,7 +93,7 @@ def write_report(
 
 
 def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> c.Page:
-    """What the report shows; the bar counts its sections."""
+    """Make the page of the report; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
     chapters: list[c.Chapter] = []
     with Progress(len(parts), "drawing the report") as bar:
@@ -129,14 +129,14 @@ def page_of_run(run: "FinishedRun") -> c.Page:
 
 
 def solve_head(case: Case, result: Mapping[str, Any]) -> c.Head:
-    """Of the report, drawn now."""
+    """Make the head of the report, as of now."""
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     meta = f"{case.path.name} · {result['formulation']} formulation · {now}"
     return run_head(f"Co-design of {run_name(case.path)}", result, meta, conclusion(result))
 
 
 def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:
-    """What makes the sections, in their order."""
+    """List what makes the sections, in their order."""
     verified, result = solution.verified, solution.result
     if verified is None:
         return []
@@ -192,7 +192,7 @@ def _required_first(result: Mapping[str, Any], chapter: c.Chapter) -> c.Chapter:
 
 
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
-    """What result.json says of the design."""
+    """Make the chapter of the design from result.json."""
     if "proof" in result:
         rows, bound = facts("structured", problem, result), binding_words(problem, result)
     else:

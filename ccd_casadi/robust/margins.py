@@ -40,12 +40,12 @@ def mu_bound(M: NDArray) -> Array:
     >>> float(mu_bound(np.array([[[0.0, 4.0], [1.0, 0.0]]]))[0].round(6))
     2.0
     """
-    x = _balanced(M)
+    x = _balance(M)
     scaled = np.exp(x[:, :, None] - x[:, None, :]) * M
     return np.linalg.svd(scaled, compute_uv=False)[:, 0]
 
 
-def _balanced(M: NDArray, *, sweeps: int = 10, settled: float = 1e-4) -> Array:
+def _balance(M: NDArray, *, sweeps: int = 10, settled: float = 1e-4) -> Array:
     """x (k, n): every row of e^x M e^-x as long as its column, off the diagonal; after `sweeps` at
     most, or a step below `settled`."""
     size = np.abs(M) ** 2
@@ -98,7 +98,7 @@ class StructuredBound:
 
     @property
     def shift(self) -> float:
-        """By how much every natural frequency may err then, up or down (relative)."""
+        """The relative error of every natural frequency that is covered, up or down."""
         return float(np.sqrt(1.0 + self.stiffness)) - 1.0
 
 
@@ -106,8 +106,8 @@ def structured_bound(
     plant: ScaledPlant, modal: ModalPlant, controller: StateSpace, hz: Array,
     options: StructuredBoundOptions = StructuredBoundOptions(),
 ) -> StructuredBound | None:  # fmt: skip
-    """From a grid in Hz, refined where it is decided; None without a flexible mode in the loop,
-    and of a plant of first order, whose modes are not masses on springs."""
+    """Compute the bound from a grid in Hz, refined where it is decided; None without a flexible
+    mode in the loop, and of a plant of first order, whose modes are not masses on springs."""
     residue = np.linalg.norm(modal.B, axis=1) * np.linalg.norm(modal.C, axis=0)
     kept = np.flatnonzero(~modal.rigid & (residue > options.seen * residue.max()))
     if kept.size == 0 or modal.states is not None:
@@ -244,7 +244,7 @@ def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
     """
     rms = []
     for kind, density in ((SourceKind.SENSOR_NOISE, sensor), (SourceKind.FORCE, disturbance)):
-        model = process(loop, ErrorSource(kind.value, kind, ShapedSpectrum(density**2))).balanced()
+        model = process(loop, ErrorSource(kind.value, kind, ShapedSpectrum(density**2))).balance()
         P = Lyapunov(model.A, sampled=model.sampled).covariance(model.noise)
         position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (model.C, model.F))
         force = np.full_like(force, np.inf) if model.infinite_force else force + (model.V**2).sum(1)

@@ -23,7 +23,7 @@ from ccd_casadi.codesign.survival import (
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import free_modal, plant_of
 from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
-from ccd_casadi.lti.loop import Loop, sampled
+from ccd_casadi.lti.loop import Loop, zoh
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sensitivity, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
@@ -69,7 +69,7 @@ def sampled_compliance(
     end, S = np.pi / held.period, closed_loop(held, K).S
     near = root_flanks(np.concatenate([S.rates, plant.poles]))
     forced, counted = getattr(plant, "mechanics", plant), getattr(plant, "counted", None)
-    driven = None if counted is None else sampled(counted, held.period, delay)
+    driven = None if counted is None else zoh(counted, held.period, delay)
     grid = frequency_grid(end * 10.0**-decades, end, decades * per_decade, near)
 
     def gain(at: Array) -> Array:
@@ -125,7 +125,7 @@ def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Pert
         f = loop_figures(closed_loop(*loop.as_run), loop.at)
         height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.poles.real.max())
         return PerturbedLoop(place, f.stable, f.bandwidth, height, growth)
-    figures = run.measured(plant, run.controller)
+    figures = run.measure(plant, run.controller)
     stable = figures.certificate.stable
     peak = figures.sensitivity_peak if stable else np.inf
     return PerturbedLoop(place, stable, figures.bandwidth, peak, figures.certificate.max_real_pole)
@@ -243,15 +243,15 @@ class Tolerances:
 
     @property
     def unstable(self) -> int:
-        """How many of the random plants are."""
+        """The number of the random plants that are unstable."""
         return sum(not item.stable for item in self.judged)
 
     def above(self, peak: float) -> int:
-        """How many of the stable ones have a larger peak of S."""
+        """Count the stable ones that have a larger peak of S."""
         return sum(item.stable and item.peak > peak for item in self.judged)
 
     def within(self, S_max: float) -> Yield:
-        """How many of the random plants are stable with a peak of S up to S_max."""
+        """Return the yield of the random plants that are stable with a peak of S up to S_max."""
         return Yield(sum(one.stable and one.peak <= S_max for one in self.judged), len(self.judged))
 
 

@@ -122,7 +122,7 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
     sampled, modal = loop.sampling is not None, run.modal()
     profile = setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
-    bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
+    bounded = kind_of(run.problem).gain_bounds(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
     # a grid ends just below half the rate
     ends = [] if loop.sampling is None else [0.999 * 0.5 / loop.sampling.period]
@@ -214,8 +214,8 @@ def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
         "noise": noise,
         "resonance_shift": _line(study.shift, "shift"),
         "damping": _line(study.damping, "factor"),
-        "single_modes": [_judged(item, "hz", "shift") for item in study.modes],
-        "worst_shift_and_damping": _judged(study.box, "shift", "damping"),
+        "single_modes": [_figures_of(item, "hz", "shift") for item in study.modes],
+        "worst_shift_and_damping": _figures_of(study.box, "shift", "damping"),
         "tolerances": {
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
@@ -225,7 +225,7 @@ def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
             "yield": hard.within(S_max).entry,
             "peak_quantiles": dict(zip(("50", "95", "100"), quantiles, strict=False)),
             "worst": {"theta": dict(zip(run.problem.names, hard.worst.place, strict=True))}
-            | _judged(hard.worst),
+            | _figures_of(hard.worst),
         },
         "structured": structured,
         "move": {
@@ -282,8 +282,8 @@ def _disk(margin: DiskMargin) -> dict[str, float]:
     return vars(margin) | {"gain": margin.gain, "phase_deg": margin.phase_deg}
 
 
-def _judged(item: PerturbedLoop, *places: str) -> dict[str, Any]:
-    """Its figures, after the first of its places by these names."""
+def _figures_of(item: PerturbedLoop, *places: str) -> dict[str, Any]:
+    """Write its figures, after the first of its places by these names."""
     return dict(zip(places, item.place, strict=False)) | {
         "stable": item.stable,
         "bandwidth_hz": item.bandwidth / HZ,
@@ -295,7 +295,7 @@ def _line(line: Line, name: str) -> dict[str, Any]:
     return {
         "stable_between": list(line.stable),
         "S_max_between": list(line.within),
-        "plants": [_judged(item, name) for item in line.judged],
+        "plants": [_figures_of(item, name) for item in line.judged],
     }
 
 

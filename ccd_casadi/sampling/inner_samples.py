@@ -12,7 +12,7 @@ from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.sampling.store import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import restored
+from ccd_casadi.support.json_files import restore
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -28,7 +28,7 @@ class SynthesisCounts:
 
     Attributes
     ----------
-    told : float
+    reported : float
         The least J that was reported as the best so far.
     """
 
@@ -43,7 +43,8 @@ class SynthesisCounts:
         return np.array([perf_counter(), process_time() + beside])
 
     def seconds(self) -> dict[str, dict[str, float]]:
-        """Of the wall and of processors, workers' included, by purpose, up to now."""
+        """Return the seconds of the wall and of processors, workers' included, by purpose, up to
+        now."""
         now = self._clocks()
         before = self._seconds.get(self.purpose, np.zeros(2))
         self._seconds[self.purpose] = before + now - self._since
@@ -81,12 +82,12 @@ class SynthesisCounts:
 
     @property
     def total(self) -> int:
-        """Of all purposes."""
+        """The number for all purposes."""
         return sum(count for _, count in self._units.values())
 
     @property
     def by_purpose(self) -> dict[str, int]:
-        """In the order in which they came up."""
+        """The numbers by purpose, in the order in which they came up."""
         found: dict[str, int] = {}
         for purpose, count in self._units.values():
             found[purpose] = found.get(purpose, 0) + count
@@ -94,7 +95,7 @@ class SynthesisCounts:
 
 
 def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
-    """Of result.json: all syntheses, by purpose, and those that led to the design.
+    """Write the entry of result.json: all syntheses, by purpose, and those that led to the design.
 
     Parameters
     ----------
@@ -170,7 +171,7 @@ class InnerSample(InnerValue):
 
     @property
     def x(self) -> tuple[float, ...]:
-        """What a surrogate of it is over: θ."""
+        """The input of a surrogate of it: θ."""
         return self.theta
 
     @property
@@ -243,12 +244,13 @@ def sample_of(
 
 
 def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
-    """What was stored of a unit of work. Raises KeyError, TypeError or ValueError if damaged."""
+    """Read what was stored of a unit of work. Raises KeyError, TypeError or ValueError if
+    damaged."""
     gradient = payload["gradient"] or [None] * len(theta)
     nothing = dict.fromkeys(("bandwidth", "omega_S", "omega_T"), np.nan) | {"violation": np.inf}
     given = nothing | {key: value for key, value in payload.items() if value is not None}
     given |= {"theta": theta, "gradient": [np.nan if v is None else v for v in gradient]}
-    sample: InnerSample = restored(InnerSample, given)
+    sample: InnerSample = restore(InnerSample, given)
     sizes = [1.0 if payload.get("error") is None else sample.error]
     if payload["bandwidth"] is not None:
         sizes += [sample.bandwidth]
@@ -258,8 +260,8 @@ def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
     return sample
 
 
-def unsearched(theta: tuple[float, ...]) -> InnerSample:
-    """What is known at a θ that was not searched, since the time was up."""
+def unsearched_sample(theta: tuple[float, ...]) -> InnerSample:
+    """Make the sample of a θ that was not searched, since the time was up."""
     nothing = dict.fromkeys(("bandwidth", "gradient", "omega_S", "omega_T", "violation"))
     words = "the time budget ended before this theta was searched"
     own = {"active": [], "shortfall": words, "syntheses": 0}

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ccd_casadi.inner_problem.objective import TrueQuantities, objective, violated
+from ccd_casadi.inner_problem.objective import TrueQuantities, objective, violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling.inner_samples import (
     InnerSample,
@@ -22,8 +22,8 @@ from ccd_casadi.sampling.inner_samples import (
     inner_sample,
     quantity_sample,
     sample_of,
-    unsearched,
     unsearched_quantities,
+    unsearched_sample,
 )
 from ccd_casadi.sampling.store import Sample, SampleStore
 from ccd_casadi.sampling.unit_kinds import inner_unit, units_of
@@ -33,7 +33,7 @@ from ccd_casadi.sampling.units import (
     hashes_of,
     problem_hash,
     sample_key,
-    timed,
+    solve_in_time,
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.lent_pool import LentWorkers
@@ -218,17 +218,17 @@ class Sampler:
         new = [theta for theta in points if theta not in self.solved]
         begin = units_of(self.problem).begin
         self._learn({theta: begin(self.problem, known, theta) for theta in new}, label)
-        return [self.solved.get(theta) or unsearched(theta) for theta in points]
+        return [self.solved.get(theta) or unsearched_sample(theta) for theta in points]
 
     def value_from(self, theta: Sequence[float], kappa: Sequence[float]) -> InnerSample:
         """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
         point = tuple(float(v) for v in theta)
         start = units_of(self.problem).begin_at(self.problem, kappa)
         self._learn({point: start}, "from a controller")
-        return self.solved.get(point) or unsearched(point)
+        return self.solved.get(point) or unsearched_sample(point)
 
     def latest(self, samples: Sequence[InnerSample]) -> list[InnerSample]:
-        """What is known by now at the θ of samples."""
+        """Return the present samples at the θ of older ones."""
         return [self.solved.get(sample.theta, sample) for sample in samples]
 
     def _learn(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
@@ -259,7 +259,7 @@ class Sampler:
             unit = partial(inner_unit, workers=self.workers) if alone else inner_unit
             # of a single θ something is known at any time: what ends a search builds on it
             of_key = {task[2]: (unit, task, len(tasks) == 1) for task in tasks}
-            for key, (found, whole) in results(self.workers, timed, of_key):
+            for key, (found, whole) in results(self.workers, solve_in_time, of_key):
                 theta = missing[key]
                 if found is None:
                     not_searched("theta")
@@ -280,7 +280,7 @@ class Sampler:
             try:
                 sample = inner_sample(theta, known)
             except (KeyError, TypeError, ValueError) as error:
-                raise self.store.damaged() from error
+                raise self.store.damaged_error() from error
             before = self.solved.get(theta, sample)
             gain = self.problem.figure.gain(sample.value, before.value)  # NaN: one is infeasible
             if theta not in self.solved or gain > 0.0 or sample.feasible > before.feasible:
@@ -303,7 +303,7 @@ class Sampler:
         slopes = (len(self.problem.names) + 2) * (2 + len(self.problem.inner.bounds))
         known = {key: s for key, s in self.store.get(keys).items() if s.gradients is not None}
         if any(len(sample.gradients or ()) != slopes for sample in known.values()):
-            raise self.store.damaged()
+            raise self.store.damaged_error()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
         size = min(
             self.chunk, max(1, -(-len(todo) // self.workers.count))
@@ -313,7 +313,7 @@ class Sampler:
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
         with Progress(len(todo), label, quiet=self.quiet) as progress:
             parts = {i: (design_unit, (self.problem, chunk)) for i, chunk in enumerate(chunks)}
-            for i, (made, _) in results(self.workers, timed, parts):
+            for i, (made, _) in results(self.workers, solve_in_time, parts):
                 if made is None:
                     not_searched("design", len(chunks[i]))
                     continue
@@ -335,14 +335,15 @@ class Sampler:
     @cached_property
     def truth(self) -> TrueQuantities:
         """The true quantities at any x, for IPOPT and what polishes: made in this process."""
-        return TrueQuantities(self.problem, self._recorded)
+        return TrueQuantities(self.problem, self._record)
 
     def cached(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
-        """What `make` gives at a point of this problem, once for all runs on the store."""
+        """Return the value of `make` at a point of this problem, made once for all runs on the
+        store."""
         owner = problem_hash({what: self.inner_hash})
         return self.store.cached(sample_key(owner, point), owner, point, kind, make)
 
-    def _recorded(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
+    def _record(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
         """A design made outside the pool (IPOPT on the true function): a row too, and counted."""
         point = tuple(float(v) for v in x)
         design = self.cached("design", point, Sensitivities, make)
@@ -370,12 +371,12 @@ class Sampler:
         if not self.spent.once(key, count):
             return
         J, value = np.nan, bandwidth if value is None else value
-        if np.isfinite(value) and not violated(self.problem, theta):
+        if np.isfinite(value) and not violations(self.problem, theta):
             J = objective(self.problem, theta, value)
         self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(J)))
 
     def report(self, before: int) -> None:
-        """On stderr: the best design, if it is one of those after the first `before`."""
+        """Report on stderr the best design, if it is one of those after the first `before`."""
         J = np.array([entry.objective for entry in self.trace])
         if self.quiet or np.isnan(J[before:]).all():
             return

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import plain, restored
+from ccd_casadi.support.json_files import plain, restore
 from ccd_casadi.support.time_budget import time_is_up
 
 DAMAGED = "a row is damaged"
@@ -78,13 +78,14 @@ def to_row(sample: Sample) -> tuple[object, ...]:
 
 
 def from_row(row: Sequence[Any]) -> Sample:
-    """Its inverse. Raises sqlite3.DatabaseError for a row that `to_row` cannot have made."""
+    """Read a sample from its row. Raises sqlite3.DatabaseError for a row that `to_row` cannot have
+    made."""
     values: dict[str, Any] = dict(zip(COLUMNS, row, strict=True))
     values |= {name: math.nan for name in _REALS if values[name] is None}
-    values["theta"] = numbers_of(decoded(values["theta"]))
+    values["theta"] = numbers_of(decode(values["theta"]))
     values["certified"] = bool(values["certified"])
     if values["gradients"] is not None:
-        values["gradients"] = numbers_of(decoded(values["gradients"]))
+        values["gradients"] = numbers_of(decode(values["gradients"]))
     if not all(isinstance(values[name], str) for name in _TEXTS):
         raise sqlite3.DatabaseError(DAMAGED)
     numbers_of([values[name] for name in _REALS])
@@ -100,7 +101,7 @@ def numbers_of(items: Any) -> tuple[float, ...]:
     return tuple(math.nan if item is None else float(item) for item in items)
 
 
-def decoded(text: Any) -> Any:
+def decode(text: Any) -> Any:
     """A value from its JSON. Raises sqlite3.DatabaseError for what is none."""
     try:
         return json.loads(text)
@@ -153,7 +154,7 @@ class SampleStore(AbstractContextManager["SampleStore"]):
 
     def __init__(self, path: str | Path, busy_seconds: float = 60.0) -> None:
         self.path, self.busy_seconds = Path(path), busy_seconds
-        with self.worded():
+        with self.reword_errors():
             self._db = sqlite3.connect(self.path, timeout=busy_seconds, isolation_level=None)
             try:
                 self._check()
@@ -214,13 +215,13 @@ class SampleStore(AbstractContextManager["SampleStore"]):
 
     def put_problem(self, key: str, problem: Mapping[str, object]) -> None:
         """Keep what a problem hash stands for, so that the file explains itself."""
-        with self.worded(), self._transaction():
+        with self.reword_errors(), self._transaction():
             text = json.dumps(problem, sort_keys=True)
             self._db.execute("insert or ignore into problems values (?, ?)", (key, text))
 
     def put(self, samples: Iterable[Sample], problem: str | None = None) -> None:
         """Write samples in one transaction; known keys stay as they are, but gain gradients."""
-        with self.worded(), self._transaction():
+        with self.reword_errors(), self._transaction():
             self._insert(samples, problem)
 
     def put_unit(
@@ -237,7 +238,7 @@ class SampleStore(AbstractContextManager["SampleStore"]):
         """
         key, owner, theta, payload = result
         row = (key, owner, json.dumps(list(theta)), json.dumps(payload))
-        with self.worded(), self._transaction():
+        with self.reword_errors(), self._transaction():
             self._insert(samples, problem)
             way = "replace" if anew else "ignore"
             self._db.execute(f"insert or {way} into results values (?, ?, ?, ?)", row)
@@ -246,7 +247,7 @@ class SampleStore(AbstractContextManager["SampleStore"]):
         """The samples known among `keys`."""
         found: dict[str, Sample] = {}
         columns = ", ".join(COLUMNS)
-        with self.worded():
+        with self.reword_errors():
             for i in range(0, len(keys), 500):
                 part = list(keys[i : i + 500])
                 marks = ", ".join("?" * len(part))
@@ -257,9 +258,9 @@ class SampleStore(AbstractContextManager["SampleStore"]):
 
     def get_result(self, key: str) -> dict[str, Any] | None:
         """The payload of a unit of work, None where it is not known."""
-        with self.worded():
+        with self.reword_errors():
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
-            return None if row is None else decoded(row[0])
+            return None if row is None else decode(row[0])
 
     def cached(
         self, key: str, owner: str, theta: Sequence[float], kind: type[T], make: Callable[[], T]
@@ -276,15 +277,15 @@ class SampleStore(AbstractContextManager["SampleStore"]):
                 self.put_unit([], (key, owner, theta, plain(made)))
             return made
         try:
-            found: T = restored(kind, stored)
+            found: T = restore(kind, stored)
             return found
         except (KeyError, TypeError, ValueError) as error:
-            raise self.damaged() from error
+            raise self.damaged_error() from error
 
     def select(self, problem: str | None = None) -> list[Sample]:
         """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
         where, given = _of(problem)
-        with self.worded():
+        with self.reword_errors():
             query = f"select {', '.join(COLUMNS)} from samples {where}"
             rows = self._db.execute(query, given).fetchall()
             samples = [from_row(row) for row in rows]
@@ -293,20 +294,20 @@ class SampleStore(AbstractContextManager["SampleStore"]):
     def count(self, problem: str | None = None) -> int:
         """Number of samples (of one problem hash, if given)."""
         where, given = _of(problem)
-        with self.worded():
+        with self.reword_errors():
             query = f"select count(*) from samples {where}"
             return int(self._db.execute(query, given).fetchone()[0])
 
     def thetas(self, problem: str) -> list[tuple[float, ...]]:
         """θ of every unit of work of one problem hash, oldest first."""
         query = "select theta from results where problem = ? order by rowid"
-        with self.worded():
-            return [numbers_of(decoded(row[0])) for row in self._db.execute(query, (problem,))]
+        with self.reword_errors():
+            return [numbers_of(decode(row[0])) for row in self._db.execute(query, (problem,))]
 
     def keys_with_gradients(self, problem: str) -> list[str]:
         """Keys of the samples of one problem hash that have gradients, oldest first."""
         query = "select key from samples where problem = ? and gradients is not null order by rowid"
-        with self.worded():
+        with self.reword_errors():
             return [row[0] for row in self._db.execute(query, (problem,))]
 
     def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
@@ -324,12 +325,12 @@ class SampleStore(AbstractContextManager["SampleStore"]):
             self._db.execute("begin immediate")
             yield
 
-    def damaged(self) -> SampleStoreError:
-        """What to raise where a row cannot be what was written."""
+    def damaged_error(self) -> SampleStoreError:
+        """Return the error for a row that cannot be what was written."""
         return SampleStoreError(f"{self.path}: {DAMAGED}; move it away or choose another --out")
 
     @contextmanager
-    def worded(self) -> Iterator[None]:
+    def reword_errors(self) -> Iterator[None]:
         """SQLite's errors as one line that says what to do."""
         try:
             yield

@@ -110,7 +110,7 @@ def promising_starts(
 
 
 def _usable(known: Iterable[InnerSample]) -> list[InnerSample]:
-    """Those with a controller of fixed structure, and slopes."""
+    """Select the samples with a controller of fixed structure, and slopes."""
     return [one for one in known if one.kappa and np.isfinite(one.gradient).all()]
 
 
@@ -132,7 +132,7 @@ def _nearest(
 
 
 class StructuredUnits(InnerUnits):
-    """Of a fixed structure: one row a search, without frequencies of weights."""
+    """The units of work of a fixed structure: one row a search, without frequencies of weights."""
 
     def solve(
         self, problem: CoDesignProblem, problem_key: str, key: str, theta: Theta,

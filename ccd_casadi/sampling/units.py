@@ -204,7 +204,7 @@ class InnerUnits(ABC):
         return []
 
 
-def timed(
+def solve_in_time(
     unit: Callable[[Task], R], task: Task, at_any_time: bool = False
 ) -> tuple[R | None, bool]:
     """A unit of work, None where the time was up before unless it is due `at_any_time`, and whether
@@ -215,7 +215,8 @@ def timed(
 
 
 class MixedUnits(InnerUnits):
-    """Of mixed sensitivity: every synthesis of a search of (ω_S, ω_T) is a row."""
+    """The units of work of mixed sensitivity: every synthesis of a search of (ω_S, ω_T) is a
+    row."""
 
     def solve(
         self, problem: CoDesignProblem, problem_key: str, key: str, theta: Theta,
@@ -230,7 +231,7 @@ class MixedUnits(InnerUnits):
 def unit_of(
     problem_key: str, theta: tuple[float, ...], result: InnerResult, inner: InnerBounds, each: float
 ) -> Unit:
-    """What the store keeps of one θ's inner problem.
+    """Return what the store keeps of one θ's inner problem.
 
     Parameters
     ----------

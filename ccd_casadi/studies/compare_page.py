@@ -23,7 +23,7 @@ from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.steepest_descent import baseline_of, run_entry
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import HZ, counted, number, package_text, versions
+from ccd_casadi.support.text import HZ, number, package_text, plural, versions
 
 PUBLISHED: dict[str, dict[str, Any]] = json.loads(package_text("studies/published.json"))
 
@@ -82,7 +82,8 @@ def decision(figures: dict[str, Any]) -> str:
 
 
 def stable_words(figures: dict[str, Any]) -> str:
-    """For resonances how far off a loop is stable, in %; what is not known is a dash."""
+    """Describe for which errors of resonances a loop is stable, in %; what is not known is a
+    dash."""
     shift = figures.get("verdict", {}).get("survives", {}).get("stable_shift")
     return "–" if not shift else f"{100.0 * shift[0]:+.2g} to {100.0 * shift[1]:+.2g} %"
 
@@ -96,7 +97,7 @@ def _beside(figures: dict[str, Any]) -> str:
 def _descent(
     problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str, equal: float
 ) -> tuple[dict[str, Any], list[str]]:
-    """How far a descent ends from the best, and what stopped it."""
+    """Describe how far a descent ends from the best, and what stopped it."""
     gap = run["objective"] - best["objective"]
     ratio = run["syntheses"] / best["syntheses_to_optimum"]
     ends = zip(run["theta"].values(), best["theta"].values(), *box(problem), strict=True)
@@ -113,7 +114,7 @@ def _descent(
     took = "1 synthesis" if run["syntheses"] == 1 else f"{run['syntheses']} syntheses"
     many = "as many" if run["syntheses"] == best["syntheses_to_optimum"] else many
     words = [
-        f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
+        f"S{LABELS[name][1:]} (best of {plural(run['runs'], 'run')}) ends at J = "
         f"{run['objective']:.4f}, {above}, after {took}, "
         f"{many}; all its runs together took {run['syntheses_of_all_runs']}."
     ]

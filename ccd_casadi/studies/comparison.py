@@ -16,7 +16,7 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem.objective import constraint_sizes, objective, violated
+from ccd_casadi.inner_problem.objective import constraint_sizes, objective, violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import modal_plant
@@ -150,7 +150,7 @@ def _from_start(
         if abs(predicted / omega - 1.0) <= options.tolerance or np.isnan(omega):
             break
         solutions = (*solutions[1 - options.model_points :], theta)
-    met = bool(omega >= resonance * (1.0 - options.tolerance)) and not violated(problem, point)
+    met = bool(omega >= resonance * (1.0 - options.tolerance)) and not violations(problem, point)
     return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
 
 
@@ -203,7 +203,7 @@ class Method:
 
 @dataclass(frozen=True)
 class _Setting:
-    """What every method is given: stores go to `folder`."""
+    """The setting that every method is given: stores go to `folder`."""
 
     case: Case
     problem: CoDesignProblem
@@ -265,7 +265,7 @@ def compare(
     began = perf_counter()
     given = _Setting(case, problem, folder, workers, seed, quiet)
     methods = [_formulation(given, name) for name in FORMULATIONS]
-    problem = _chosen(problem, methods)
+    problem = _choose_plant(problem, methods)
     given = replace(given, problem=problem)
     descents = _descents(given)
     methods += [_best_descent(problem, descents, each, workers)
@@ -274,7 +274,7 @@ def compare(
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
 
 
-def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
+def _choose_plant(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
     """The problem with the design plant of the best formulation, where the case leaves it open.
 
     And with what its search has added: warm starts and plants of a fixed structure.
@@ -380,7 +380,7 @@ def _figures(
     what it survives: it may look better than a run's by not having been asked."""
     baseline = baseline_of(problem)
     own = baseline.figures(theta, design)
-    made, line = baseline.judged(theta, design, workers)
+    made, line = baseline.judge(theta, design, workers)
     return made, {
         **own,
         "verdict": {"survives": line.entry},

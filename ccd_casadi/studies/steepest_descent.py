@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.final_judgement import survived
+from ccd_casadi.codesign.final_judgement import judge_survival
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.structured_entries import active_of, box_findings, design_dict
 from ccd_casadi.codesign.survival import loops_of
@@ -41,7 +41,7 @@ AnyDesign = Any  # Sensitivities or SectionsDesign: what a baseline gives and ta
 
 
 class Gradient(StrEnum):
-    """Which dω_b/dθ the descent follows."""
+    """The derivative dω_b/dθ that the descent follows."""
 
     FIXED = "fixed"
     TOTAL = "total"
@@ -82,10 +82,11 @@ class Baseline(ABC):
         """A design under the contract's keys, with its status and what is active."""
 
     @abstractmethod
-    def judged(
+    def judge(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, Check]:
-        """Its controller (SI), and what that survives: the line of the verdict of a run."""
+        """Judge the design: its controller (SI), and the line of the verdict of a run on what that
+        survives."""
 
 
 class MixedBaseline(Baseline):
@@ -113,12 +114,14 @@ class MixedBaseline(Baseline):
         active = list(active_constraints(inner, found))
         return figures_dict(found) | {"status": STATUS[inner.feasible(found)], "active": active}
 
-    def judged(
+    def judge(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, Check]:
         at = (design.figures.omega_S, design.figures.omega_T)
         K = final_design(self.problem, theta, at).controller
-        found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
+        found, robust = judge_survival(
+            self.problem, loops_of(self.problem, theta, K), design.figures
+        )
         own = {} if robust is None else set_findings(robust)
         return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
@@ -145,13 +148,13 @@ class StructuredBaseline(Baseline):
         entries = design_dict(self.problem, theta, design)
         return entries | {"status": STATUS[design.certified], "active": active_of(design)}
 
-    def judged(
+    def judge(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, Check]:
         K, on_box = design.controller, DesignOnBox(self.problem, theta, design)
         worst = on_box.worst()[0]
-        wide, checked, proof = on_box.judged(worst, workers)
-        found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
+        wide, checked, proof = on_box.judge(worst, workers)
+        found = judge_survival(self.problem, loops_of(self.problem, theta, K), design)[0]
         drawn = None if proof.conclusive else on_box.fresh_yield(workers)[0]
         along = found is not None and found.within(*kind_of(self.problem).common_shifts())
         own = box_findings(wide, checked, proof, worst, drawn, along=along)
@@ -240,7 +243,7 @@ def _sweep(
 
 
 class Stop(StrEnum):
-    """Why a descent ended."""
+    """The reason why a descent ended."""
 
     SMALL_STEP = "no step improves J any more"
     STATIONARY = "the projected gradient vanishes"
@@ -335,7 +338,7 @@ def steepest_descent(
 
 
 def run_entry(descent: Descent) -> dict[str, Any]:
-    """How a descent began, and how it ended."""
+    """Write how a descent began, and how it ended."""
     return {
         "gradient": descent.gradient.value,
         "start": descent.start,

@@ -49,7 +49,7 @@ CRASHES = ("SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT")
 DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl
 
 
-def guarded(place: Path) -> Callable[[], object]:
+def run_guarded(place: Path) -> Callable[[], object]:
     """Go on in another process where the plant of a case or run folder is code; what is given is to
     be called before that ends in order. The process that waits does not return."""
     if not (sys.platform.startswith("linux") and _is_command() and _is_code(place)):
@@ -229,7 +229,7 @@ def run(
     except SystemExit as ended:  # after --help or a wrong option
         raise_on_ctrl_c()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
-    in_order = guarded(Path(str(_place(options))))
+    in_order = run_guarded(Path(str(_place(options))))
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)

@@ -31,7 +31,7 @@ class NoDesign(UserError):
     """No controller was found again where one had been: a search ends without, or with another."""
 
 
-def described(error: BaseException) -> str:
+def describe(error: BaseException) -> str:
     """Write the kind and the message of an exception of foreign code, which may have none.
 
     Parameters
@@ -111,7 +111,7 @@ def _press(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def ctrl_c_noticed() -> Iterator[None]:
-    """Within the block every Ctrl-C is remembered for `was_ctrl_c`, the last block's that is.
+    """Remember within the block every Ctrl-C for `was_ctrl_c`, the last block's that is.
 
     One that came where nothing can be raised is sent once more.
     """

@@ -40,7 +40,7 @@ SHIPPED: Mapping[str, Mapping[str, str]] = MappingProxyType({
 
 @dataclass(frozen=True)
 class Extension:
-    """What an extension adds, by names of what is imported: "module:name" where not said.
+    """The additions of an extension, by names of what is imported: "module:name" where not stated.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Extension:
 
 
 @cache
-def shipped() -> dict[str, Extension]:
+def read_shipped() -> dict[str, Extension]:
     """Read the extensions of this distribution.
 
     Returns
@@ -72,17 +72,17 @@ def shipped() -> dict[str, Extension]:
 
 
 @cache
-def installed() -> dict[str, Extension]:
+def read_installed() -> dict[str, Extension]:
     """Read all extensions, those of other distributions last.
 
     Returns
     -------
     dict of str to Extension
     """
-    return shipped() | {point.name: point.load() for point in entry_points(group=GROUP)}
+    return read_shipped() | {point.name: point.load() for point in entry_points(group=GROUP)}
 
 
-def declared(kind: str) -> dict[str, Any]:
+def collect_declared(kind: str) -> dict[str, Any]:
     """Collect what all extensions declare of one kind.
 
     Parameters
@@ -94,7 +94,7 @@ def declared(kind: str) -> dict[str, Any]:
     -------
     dict
     """
-    return {k: v for item in installed().values() for k, v in getattr(item, kind).items()}
+    return {k: v for item in read_installed().values() for k, v in getattr(item, kind).items()}
 
 
 def find(kind: str, name: str) -> Any:
@@ -109,7 +109,7 @@ def find(kind: str, name: str) -> Any:
     -------
     object or None
     """
-    for extensions in (shipped, installed):
+    for extensions in (read_shipped, read_installed):
         for item in extensions().values():
             if name in getattr(item, kind):
                 return getattr(item, kind)[name]

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from scipy.sparse import csc_array
 
-from ccd_casadi.support.errors import MissingPackage, UserError, described, require
+from ccd_casadi.support.errors import MissingPackage, UserError, describe, require
 from surrogates.files import write_whole
 
 
@@ -30,7 +30,7 @@ def hdf5_variables(path: Path) -> dict[str, Any]:
         with h5py.File(path, "r") as file:
             return {name: _value(file, file[name]) for name in file if not name.startswith("#")}
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        words = " ".join(described(error).split())[:120]
+        words = " ".join(describe(error).split())[:120]
         raise UserError(f"{path}: is not a readable MATLAB 7.3 file: {words}") from None
 
 
@@ -156,7 +156,7 @@ def json_values(value: Any) -> Any:
 
 
 def plain(value: Any, listed: bool = False) -> Any:
-    """Convert a value to JSON such that `restored` gives it back.
+    """Convert a value to JSON such that `restore` gives it back.
 
     Of a dataclass its name and fields, of an array (of float64) shape and bytes, of an enumeration
     the name, of NaN and infinity their words.
@@ -181,7 +181,7 @@ def plain(value: Any, listed: bool = False) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray) and listed:
-        return [_rounded(item) for item in value.tolist()]
+        return [_round(item) for item in value.tolist()]
     if isinstance(value, np.ndarray):
         return [list(value.shape), b64encode(value.astype("<f8").tobytes()).decode()]
     if isinstance(value, Enum):
@@ -198,15 +198,15 @@ def plain(value: Any, listed: bool = False) -> Any:
     return value
 
 
-def _rounded(item: Any, *, digits: int = 7) -> Any:
+def _round(item: Any, *, digits: int = 7) -> Any:
     if isinstance(item, list):
-        return [_rounded(each, digits=digits) for each in item]
+        return [_round(each, digits=digits) for each in item]
     if isinstance(item, float):
         return float(f"{item:.{digits}g}") if math.isfinite(item) else None
     return item
 
 
-def restored(kind: Any, data: Any) -> Any:
+def restore(kind: Any, data: Any) -> Any:
     """Convert what `plain` has made back, by the type as it is annotated.
 
     Parameters
@@ -243,17 +243,17 @@ def restored(kind: Any, data: Any) -> Any:
             return None
         alone = len(named) < 2  # then its name is not looked at: it may have had another
         one = next(item for item in args if item is not NoneType) if alone else named[data[""]]
-        return restored(one, data)
+        return restore(one, data)
     if origin is tuple:
         endless = args[1:] == (...,)
         kinds = repeat(args[0], len(data)) if endless else args
-        return tuple(restored(*item) for item in zip(kinds, data, strict=True))
+        return tuple(restore(*item) for item in zip(kinds, data, strict=True))
     if origin in (dict, Mapping):
-        return {str(key): restored(args[1], item) for key, item in dict(data).items()}
+        return {str(key): restore(args[1], item) for key, item in dict(data).items()}
     if is_dataclass(kind):
         hints, build = get_type_hints(kind), cast(Any, kind)
         there = [f for f in fields(kind) if f.name in data or f.default is MISSING]
-        return build(**{f.name: restored(hints[f.name], data[f.name]) for f in there})
+        return build(**{f.name: restore(hints[f.name], data[f.name]) for f in there})
     if issubclass(kind, Enum):
         return kind[data]
     if kind is float:

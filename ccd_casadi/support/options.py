@@ -15,7 +15,7 @@ Option = Callable[[argparse.ArgumentParser], object]  # adds one
 
 
 class ExitCode(IntEnum):
-    """How a command ended.
+    """The exit code of a command.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class ExitCode(IntEnum):
 
     @classmethod
     def of(cls, status: str) -> "ExitCode":
-        """How a command ends whose design came to this.
+        """Return the exit code of a command whose design has this status.
 
         >>> ExitCode.of("verified"), ExitCode.of("infeasible"), ExitCode.of("not_verified")
         (<ExitCode.DONE: 0>, <ExitCode.INFEASIBLE: 3>, <ExitCode.NOT_VERIFIED: 4>)
@@ -79,7 +79,7 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, as every other bad input, without the usage."""
 
     def error(self, message: str) -> NoReturn:
-        """Leave with BAD_INPUT."""
+        """Leave with BAD_INPUT and the message."""
         self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
 
 

@@ -36,7 +36,7 @@ _SHORT.maxother = _SHORT.maxstring = 60
 
 @dataclass(frozen=True)
 class PoolOptions:
-    """When worker processes pay.
+    """Thresholds from which worker processes pay.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Pool(Protocol):
 
     @property
     def count(self) -> int:
-        """How many tasks run at a time."""
+        """The number of tasks that run at a time."""
 
     def __enter__(self) -> Self: ...
 
@@ -104,13 +104,13 @@ class Workers(AbstractContextManager["Workers"]):
 
     @property
     def processor_seconds(self) -> float:
-        """What its processes have used up to now."""
+        """The processor time of its processes up to now, s."""
         return self._ended + sum(worker.processor_seconds for worker in self._workers)
 
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:
-        """As `Pool` says. A task whose worker dies is tried once more, in a new one.
+        """Map as `Pool` states. A task whose worker dies is tried once more, in a new one.
 
         A worker holds one task, and has its next before a result is handed out. Raises RuntimeError
         where another map is not yet finished.

@@ -62,7 +62,7 @@ def columns(stream: TextIO) -> int:
     return min(found or WIDTH, WIDTH)
 
 
-def wrapped(line: str, width: int) -> str:
+def wrap(line: str, width: int) -> str:
     """Break a line between words; what follows is under its words, not under its label.
 
     Parameters
@@ -91,7 +91,7 @@ def wrapped(line: str, width: int) -> str:
     )  # fmt: skip
 
 
-def coloured(line: str) -> str:
+def colour_line(line: str) -> str:
     """The word of a verdict or status behind its label in green, yellow or red."""
     if "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb":
         return line
@@ -130,7 +130,7 @@ def say(text: str, stream: TextIO | None = None) -> None:
     """
     stream, text = stream or sys.stdout, text.replace("µ", "u")
     if stream.isatty():
-        text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
+        text = "\n".join(colour_line(wrap(line, columns(stream))) for line in text.split("\n"))
         if stream is sys.stderr:  # where a bar may stand
             text = f"\r\x1b[2K{text}"
     print(text, file=stream, flush=True)
@@ -164,7 +164,7 @@ def remark(text: str, quiet: bool) -> None:
 
 @contextmanager
 def kept_quiet(yes: bool) -> Iterator[None]:
-    """Within the block `inform` and progress bars print nothing.
+    """Silence `inform` and progress bars within the block.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def kept_quiet(yes: bool) -> Iterator[None]:
 T = TypeVar("T")
 BAR_WIDTH = 24
 CELL = 100  # characters of a line in a notebook
-Tell = Callable[[str], None]  # what is given lines of progress
+Log = Callable[[str], None]  # what is given lines of progress
 
 
 class Progress:
@@ -286,12 +286,12 @@ def silent(words: str) -> None:
     """
 
 
-def titled(tell: Tell, title: str) -> Tell:
+def with_title(log: Log, title: str) -> Log:
     """Put a title before each line of progress.
 
     Parameters
     ----------
-    tell : callable
+    log : callable
         Takes a line.
     title : str
 
@@ -300,7 +300,7 @@ def titled(tell: Tell, title: str) -> Tell:
     callable
         Takes a line.
     """
-    return lambda words: tell(f"{title}: {words}")
+    return lambda words: log(f"{title}: {words}")
 
 
 def duration(seconds: float) -> str:

@@ -163,7 +163,7 @@ def with_unit(value: float, unit: str, digits: int = 3) -> str:
     return f"{number(factor * value, digits)} {read}"
 
 
-def counted(number: int, noun: str) -> str:
+def plural(number: int, noun: str) -> str:
     """Write a number of things.
 
     Parameters

@@ -135,13 +135,13 @@ def is_number(cell: str, comma: bool) -> bool:
     bool
     """
     try:
-        _parsed(cell, comma)
+        _parse(cell, comma)
     except ValueError:
         return False
     return True
 
 
-def _parsed(cell: str, comma: bool) -> complex:
+def _parse(cell: str, comma: bool) -> complex:
     cell = cell.replace(",", ".") if comma else cell
     return complex(re.sub(r"(?<=[\d.])[iI]$", "j", cell.replace(" ", "")))
 
@@ -165,7 +165,7 @@ def number_in(path: Path, line: int, cell: str, comma: bool) -> complex:
         The cell is not one.
     """
     try:
-        found = _parsed(cell, comma)
+        found = _parse(cell, comma)
     except ValueError:
         raise UserError(f"{path}: line {line}: {cell!r} is not a number") from None
     if not np.isfinite(found):

@@ -21,7 +21,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class StageOptions:
-    """Up to which share of a budget each stage of a search may last.
+    """Shares of a budget up to which each stage of a search may last.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class TimeBudget:
 
     @property
     def entry(self) -> dict[str, object]:
-        """Of result.json."""
+        """The entry of result.json."""
         minutes = self.minutes if math.isfinite(self.minutes) else None
         share = {"share": self.share} if self.ended else {}
         return {"minutes": minutes, "ended": self.ended, **share, "not_searched": dict(self.left)}
@@ -129,7 +129,7 @@ def continued(own: TimeBudget) -> Iterator[None]:
 
 @contextmanager
 def until(deadline: float) -> Iterator[None]:
-    """Within the block the time is up at a deadline, s of `time.monotonic`."""
+    """Let the time be up within the block at a deadline, s of `time.monotonic`."""
     before = _DEADLINE.set(deadline)
     try:
         yield
@@ -139,7 +139,7 @@ def until(deadline: float) -> Iterator[None]:
 
 @contextmanager
 def stage(share: float) -> Iterator[None]:
-    """Within the block the time is up with a share of the budget.
+    """Let the time be up within the block with a share of the budget.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from os.path import isfile
 from types import FrameType
 from typing import Any, NoReturn
 
-from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.errors import UserError, describe
 
 _refused: ContextVar[bool] = ContextVar("user_code_refused", default=False)
 
@@ -90,7 +90,7 @@ def raised_words(error: BaseException) -> str:
     str
     """
     place = raised_in_user_code(error)
-    return f"{described(error)} in {place}" if place else described(error)
+    return f"{describe(error)} in {place}" if place else describe(error)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class GivenFunction:
 
 @contextmanager
 def exit_refused() -> Iterator[None]:
-    """Within the block os._exit raises, in this thread; the exit of a C library does not."""
+    """Raise on os._exit within the block, in this thread; the exit of a C library is not caught."""
     caller, before = threading.current_thread(), os._exit
 
     def refuse(status: int) -> NoReturn:
@@ -149,7 +149,7 @@ def exit_refused() -> Iterator[None]:
 
 @contextmanager
 def permit_user_code(allowed: bool) -> Iterator[None]:
-    """Within the block plant functions of users run, or (--no-user-code) are refused.
+    """Permit within the block plant functions of users, or refuse them (--no-user-code).
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def with_time_limit(
             except (KeyboardInterrupt, _Late):
                 raise
             except BaseException as error:
-                if isinstance(error, Exception) and described(error) != type(error).__name__:
+                if isinstance(error, Exception) and describe(error) != type(error).__name__:
                     raise
                 words = raised_words(error)
                 if isinstance(error, _Ended | SystemExit):

@@ -209,7 +209,7 @@ class WorkerProcess:
     def answer(
         self, seconds: float | None = None, reported: Callable[[str], None] = lambda words: None
     ) -> tuple[bool, Any]:
-        """(True, what the task came to) or (False, what it raised); `told` hears what it tells.
+        """Return (True, its result) or (False, its exception); `reported` takes what it reports.
 
         Raises WorkerLost if the process died, and Overrun after so many seconds without a word.
         """
@@ -227,7 +227,8 @@ class WorkerProcess:
 
     @property
     def processor_seconds(self) -> float:
-        """What it has used up to now; 0 where the system does not tell of another process."""
+        """The processor time that it has used up to now, s; 0 where the system does not report
+        another process."""
         if not sys.platform.startswith("linux") or self.process.pid is None:
             return 0.0
         with suppress(OSError):
@@ -354,7 +355,7 @@ def interrupts_held() -> Iterator[None]:
 _to_parent: list[connection.Connection] = []  # of a worker
 
 
-def tell(words: str) -> None:
+def log(words: str) -> None:
     """Report, from within a task, how far it is to the process that waits for its result.
 
     Parameters

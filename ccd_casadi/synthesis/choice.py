@@ -85,7 +85,7 @@ def choose_inputs(
     z, least = np.full(m, count / m), np.inf  # in equal parts, for a first bound
     while True:
         at = np.maximum(z, absent)
-        value, slope = _squared(plant, weights, at)
+        value, slope = _squared_gamma(plant, weights, at)
         if np.isfinite(value):
             below = float(slope @ at) - value
             rules.append(LinearConstraint(np.append(slope, -1.0), -np.inf, below))
@@ -107,7 +107,7 @@ def choose_inputs(
     return InputChoice(best, float(np.sqrt(least)), len(squared) + (count < m), failed)
 
 
-def _squared(plant: ScaledPlant, weights: Weights, z: Array) -> tuple[float, Array]:
+def _squared_gamma(plant: ScaledPlant, weights: Weights, z: Array) -> tuple[float, Array]:
     """γ_opt² and its gradient to z; NaN where the synthesis is not certified."""
     m, B = len(z), plant.B * np.sqrt(z)
     there = replace(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ccd_casadi.kernels.certified_design import judge
 from ccd_casadi.kernels.sensitivity import Column
-from ccd_casadi.lti.state_space import StateSpace, balanced, equivalent_open_loop
+from ccd_casadi.lti.state_space import StateSpace, balance_system, equivalent_open_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import (
@@ -99,8 +99,9 @@ def classical_margins(
 
 
 def _crossover(falls: Array, lowest: float, above: bool) -> float:
-    """Of all ln ω where |L| passes 1 the one below which it is above 1, and above it below, over
-    most of ln ω: neither a graze at low frequencies nor a resonance further up is the crossover.
+    """Select of all ln ω where |L| crosses 1 the one below which it is above 1, and above it below,
+    over most of ln ω: neither a graze at low frequencies nor a resonance further up is the
+    crossover.
 
     `above`: whether it is at the `lowest` ln ω. inf where it never falls through 1.
     """
@@ -140,7 +141,7 @@ def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins
 
 
 def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
-    """Of several loops the margins nearest to instability, and the lowest crossover.
+    """Return of several loops the margins nearest to instability, and the lowest crossover.
 
     Parameters
     ----------
@@ -168,7 +169,7 @@ def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
 def _crossings(
     function: Callable[[Array], Array], values: Array, omega: Array, sections: int = 15
 ) -> Array:
-    """Where a function changes sign, one place for every two neighbours that it does between.
+    """Find where a function changes sign, one place for every two neighbours that it does between.
 
     Each of `sections` divides their interval by ten: 15 of them reach rounding."""
     at = np.flatnonzero(np.diff(np.signbit(values)))
@@ -222,9 +223,9 @@ def measure(
     row[Column.LIMITED_BY_BOUND] = 0.0
     K = controller.in_units(w0, plant.force)
     # what rounding may move the loop's poles by grows with the entries: sections are not balanced
-    A, B, C, D = *balanced(K.A, K.B, K.C), np.ascontiguousarray(K.D)
+    A, B, C, D = *balance_system(K.A, K.B, K.C), np.ascontiguousarray(K.D)
     level = CertificateOptions().unbounded if gamma is None else gamma
-    judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, level,
+    judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scale(w0), weights.delta, level,
           omega_low / w0, row)  # fmt: skip
     return figures_from_row(row, weights, w0)
 

@@ -29,7 +29,7 @@ _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 
 @dataclass(frozen=True)
 class DesignDerivatives:
-    """What was made, in scaled units: for what else is read off the same design.
+    """The design in scaled units, from which further derivatives are read.
 
     `row` of its figures, (A_K, B_K, C_K), dγ_opt to θ and weights; `worst` is the place in its
     family of the plant that has ‖S‖∞, 0 the plant itself.
@@ -115,8 +115,8 @@ def sensitivities(
     w0, count = plant.omega_0, plant.dA.shape[0]
     made_on = plant.design_plant
     names = _WEIGHTS + (("disturbance",) if weights.delta else ())
-    scaled = np.append(weights.scaled(w0), weights.delta)
-    made_for = MadeFor(made_on, weights.scaled(w0), gamma_backoff, weights.delta)
+    scaled = np.append(weights.scale(w0), weights.delta)
+    made_for = MadeFor(made_on, weights.scale(w0), gamma_backoff, weights.delta)
     made = None
     try:
         # Rounding may put the blocks' γ_opt below the whole plant's: it is then made from that.
@@ -189,7 +189,7 @@ class PeakGridOptions:
 
     @cached_property
     def broad(self) -> Array:
-        """ω over ω₀."""
+        """The broad grid of ω over ω₀."""
         return np.geomspace(10.0**-self.decades, 10.0**self.decades, self.points)
 
 
@@ -244,7 +244,7 @@ def local_peaks_with_gradients(
     made = design.made
     if made is None or made.row[Column.CODE] != Code.CERTIFIED or made.row[Column.BALANCED]:
         return ()
-    w0, w = plant.omega_0, weights.scaled(plant.omega_0)
+    w0, w = plant.omega_0, weights.scale(plant.omega_0)
     found = [
         (omega, i, gain)
         for i, member in enumerate(plant.members)

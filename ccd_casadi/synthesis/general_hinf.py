@@ -26,9 +26,9 @@ import numpy as np
 from scipy.linalg import block_diag, svd
 
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.errors import UserError, describe
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.general_levels import (
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class HinfDesign(NamedTuple):
-    """As `control.hinfsyn` returns it, with the certificate in place of `rcond`."""
+    """The result of `control.hinfsyn`, with the certificate in place of `rcond`."""
 
     K: "control.StateSpace"
     CL: "control.StateSpace"
@@ -58,7 +58,7 @@ class HinfDesign(NamedTuple):
 
 
 class MixsynDesign(NamedTuple):
-    """As `control.mixsyn` returns it: `info` is γ and the certificate."""
+    """The result of `control.mixsyn`: `info` is γ and the certificate."""
 
     K: "control.StateSpace"
     CL: "control.StateSpace"
@@ -169,7 +169,7 @@ def _state_space(system: Any, name: str) -> "control.StateSpace":
         made = system if isinstance(system, ct.StateSpace) else ct.ss(system)
     except (TypeError, ValueError, NotImplementedError) as error:
         raise UserError(
-            f"{name} is no proper system of python-control ({described(error)}); give a "
+            f"{name} is no proper system of python-control ({describe(error)}); give a "
             "StateSpace or a proper TransferFunction"
         ) from None
     if not all(np.isfinite(part).all() for part in (made.A, made.B, made.C, made.D)):
@@ -245,7 +245,7 @@ def general_synthesis(
     ------
     NoHinfController
     """
-    A, B, C = balanced(P.A, P.B, P.C) if len(P.A) else (P.A, P.B, P.C)
+    A, B, C = balance_system(P.A, P.B, P.C) if len(P.A) else (P.A, P.B, P.C)
     p1, m1 = P.D.shape[0] - nmeas, P.D.shape[1] - ncon
     D12, D21, D22 = P.D[:p1, m1:], P.D[p1:, :m1], P.D[p1:, m1:]
     require_assumptions(A, B[:, :m1], B[:, m1:], C[:p1], C[p1:], D12, D21, options)
@@ -267,7 +267,7 @@ def general_synthesis(
             continue
         K = _with_feedthrough(made, D22)
         if len(K.A):
-            K = StateSpace(*balanced(K.A, K.B, K.C), K.D)
+            K = StateSpace(*balance_system(K.A, K.B, K.C), K.D)
         CL = lower_transformation(P, K, nmeas, ncon)
         slowest = float(np.linalg.eigvals(CL.A).real.max(initial=-np.inf))
         norm, _ = hinf_norm(CL)  # infinite where it is not stable

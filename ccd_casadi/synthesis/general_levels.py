@@ -16,7 +16,7 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class HinfCertificate:
-    """What is known of a closed loop by its own matrices.
+    """The certificate of a closed loop by its own matrices.
 
     Attributes
     ----------
@@ -81,10 +81,10 @@ def largest_apart(
     omega = np.sort(np.concatenate([grid, sizes]))
     p2 = K.D.shape[1]
     p1, m1 = np.subtract(P.D.shape, K.D.T.shape)
-    G, C = P.swept(omega), K.swept(omega)
+    G, C = P.sweep(omega), K.sweep(omega)
     back = np.linalg.solve(np.eye(p2) - G[:, p1:, m1:] @ C, G[:, p1:, :m1])
     apart = sigma_max(G[:, :p1, :m1] + G[:, :p1, m1:] @ C @ back)
-    return float(apart.max()), float(np.abs(apart - sigma_max(CL.swept(omega))).max())
+    return float(apart.max()), float(np.abs(apart - sigma_max(CL.sweep(omega))).max())
 
 
 def spectral_norm(M: Array) -> float:
@@ -148,7 +148,7 @@ class HinfOptions:
 
 
 class HinfFailure(StrEnum):
-    """Why there is no controller, or none that is certified."""
+    """The reason why there is no controller, or none that is certified."""
 
     NOT_STABILISABLE = "not stabilisable"
     NOT_DETECTABLE = "not detectable"
@@ -184,7 +184,7 @@ class GeneralPlant:
 
     @property
     def least(self) -> float:
-        """What no level is below, max(σ_max[D1111 D1112], σ_max[D1111; D1121])."""
+        """The bound that no level is below, max(σ_max[D1111 D1112], σ_max[D1111; D1121])."""
         m2, p2 = len(self.unit_u), len(self.unit_y)
         p1, m1 = self.D11.shape
         return max(spectral_norm(self.D11[: p1 - m2]), spectral_norm(self.D11[:, : m1 - p2]))

@@ -24,7 +24,7 @@ from ccd_casadi.plants.table_columns import refuse_polynomials
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.matlab_systems import PARTS, realised, strings, system_of, systems_in
+from ccd_casadi.synthesis.matlab_systems import PARTS, realise, strings, system_of, systems_in
 from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class NamedSystem:
 
 @dataclass(frozen=True)
 class DesignFile:
-    """What a .mat file carries.
+    """The content of a .mat file.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def from_control(system: Any) -> StateSpace:
     if system.dt is True:
         raise UserError("the system is in discrete time without a period; give it a dt in s")
     if isinstance(system, control.TransferFunction):
-        return realised(system)
+        return realise(system)
     parts = [np.array(getattr(system, part)) for part in PARTS]
     if any(np.iscomplexobj(part) or not np.isfinite(part).all() for part in parts):
         raise UserError("the state space has an entry that is not a finite real number")

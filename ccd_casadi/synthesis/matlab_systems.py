@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from scipy.linalg import block_diag
 
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.plants.table_columns import SI as UNITS_OF_SI
 from ccd_casadi.plants.table_columns import (
     compliance_of,
@@ -40,7 +40,7 @@ class RealisationOptions:
     at_rest: float = 1e-6  # |p| over the largest that is 0
 
 
-def realised(system: "control.TransferFunction") -> StateSpace:
+def realise(system: "control.TransferFunction") -> StateSpace:
     """A state space with this response and its poles. Raises UserError where there is none."""
     import control
 
@@ -79,7 +79,7 @@ def _polynomials(system: "control.TransferFunction") -> tuple[np.ndarray, np.nda
 
 
 def _by_columns(num: np.ndarray, den: np.ndarray, period: float) -> StateSpace:
-    """In controllable companion form, one for each denominator of a column, balanced."""
+    """Realise in controllable companion form, one for each denominator of a column, balanced."""
     p, m = num.shape
     blocks, drive, reading, D = [], [], [], np.zeros((p, m))
     for j in range(m):
@@ -96,7 +96,7 @@ def _by_columns(num: np.ndarray, den: np.ndarray, period: float) -> StateSpace:
             A, B = np.eye(n, k=-1), np.zeros((n, m))
             if n:
                 A[0], B[0, j] = -np.array(d[1:]), 1.0
-            A, B, C = balanced(A, B, C) if n else (A, B, C)
+            A, B, C = balance_system(A, B, C) if n else (A, B, C)
             blocks.append(A)
             drive.append(B)
             reading.append(C)

@@ -15,12 +15,18 @@ import numpy as np
 import slycot
 
 from ccd_casadi.lti.frequency_grid import root_flanks
-from ccd_casadi.lti.loop import Sampling, in_w, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, in_w, tustin, zoh
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.lti.ports import BreakPoint
-from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, balanced, closed_loop, weighted
-from ccd_casadi.support.errors import described
-from ccd_casadi.support.text import counted
+from ccd_casadi.lti.state_space import (
+    ClosedLoop,
+    StateSpace,
+    balance_system,
+    closed_loop,
+    filter_outputs,
+)
+from ccd_casadi.support.errors import describe
+from ccd_casadi.support.text import plural
 from ccd_casadi.synthesis.weights import Weights
 
 
@@ -39,7 +45,7 @@ class SecondEngineOptions:
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """What SLICOT finds of one loop.
+    """The findings of SLICOT on one loop.
 
     `norms` by name: "S", ‖S‖∞, "KS", "T", of a continuous loop "GS", and with weights "weighted
     loop"; infinite where the loop is
@@ -53,7 +59,7 @@ class SecondOpinion:
     reason: str = ""
 
     def contradictions(self, **claims: float) -> tuple[str, ...]:
-        """What of another engine's claims this one denies: norms by name, `_` for a space.
+        """List the claims of another engine that this one denies: norms by name, `_` for a space.
 
         A loop that is not stable denies all of them.
         """
@@ -99,7 +105,7 @@ def second_opinion(
         if sampling is None:
             loop = closed_loop(plant, controller)
         else:
-            G = sampled(plant, sampling.period, sampling.delay)
+            G = zoh(plant, sampling.period, sampling.delay)
             loop = closed_loop(G, tustin(controller, sampling.period))
         poles = np.linalg.eigvals(loop.A)
         rate = float(poles.real.max())
@@ -109,16 +115,16 @@ def second_opinion(
             return SecondOpinion(False, rate, {"S": inf})
         parts = {"S": loop.S, "KS": loop.KS, "T": loop.T}
         if places:
-            whole, loop = loop, places[0].closed(loop)
+            whole, loop = loop, places[0].close_loop(loop)
             parts = {"S": loop.S, "KS": whole.KS, "T": loop.T}
-            parts |= {f"S of {place.name}": place.closed(whole).S for place in places}
+            parts |= {f"S of {place.name}": place.close_loop(whole).S for place in places}
         if not loop.period:  # sampled it is a product of functions of z and of s
             parts["GS"] = loop.GS
         norms = {name: _norm(part) for name, part in parts.items()}
         if weights is not None and not loop.period:
             norms["weighted loop"] = _norm(weighted_loop(loop, weights))
     except (slycot.exceptions.SlycotError, np.linalg.LinAlgError, ValueError) as error:
-        return SecondOpinion(False, nan, {}, f"SLICOT has no answer ({described(error)})")
+        return SecondOpinion(False, nan, {}, f"SLICOT has no answer ({describe(error)})")
     lost = [name for name, norm in norms.items() if not isfinite(norm)]
     reason = f"SLICOT has no norm of the {' and the '.join(lost)}" if lost else ""
     return SecondOpinion(True, rate, norms, reason)
@@ -135,7 +141,7 @@ def weighted_loop(loop: ClosedLoop, weights: Weights) -> StateSpace:
     if w.disturbance:
         B, D = np.hstack([B, w.disturbance * loop.B_d]), np.hstack([D, np.zeros((len(D), m))])
     rows = np.repeat(w.filters(), [p, m, len(outputs[2][0])], axis=0)
-    return weighted(StateSpace(loop.A, B, C, D), rows)
+    return filter_outputs(StateSpace(loop.A, B, C, D), rows)
 
 
 def _norm(system: StateSpace, options: SecondEngineOptions = SecondEngineOptions()) -> float:
@@ -150,7 +156,7 @@ def _norm(system: StateSpace, options: SecondEngineOptions = SecondEngineOptions
     none at all 45 % in w; balanced they agree to 1e-11.
     """
     over = in_w(system) if system.period else system
-    A, B, C = balanced(over.A, over.B, over.C)
+    A, B, C = balance_system(over.A, over.B, over.C)
     size, named = (len(A), B.shape[1], len(C)), []
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of its own accuracy
@@ -202,14 +208,14 @@ class EngineComparison:
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The comparison in one line."""
         if self.agrees:
-            return f"SLICOT agrees on {counted(self.loops, 'loop')}"
+            return f"SLICOT agrees on {plural(self.loops, 'loop')}"
         return self.denied or self.unknown or "no loop was given to SLICOT"
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json."""
+        """The entry of result.json."""
         return {"engine": "SLICOT ab13dd", "loops": self.loops, "agrees": self.agrees,
                 "words": self.words}  # fmt: skip
 
@@ -217,7 +223,7 @@ class EngineComparison:
 NOT_COMPARED = EngineComparison(0)
 
 
-def compared(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> EngineComparison:
+def compare_engines(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> EngineComparison:
     """Compare the opinion on each loop with another engine's claims on it.
 
     Parameters

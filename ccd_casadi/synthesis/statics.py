@@ -156,7 +156,9 @@ def statics(
             rate = Sampling(1.0 / controller.period) if controller.period else None
             loop = Loop(plant, controller, rate, drive=ports.drive, counted=ports.counted)
             at = np.array([omega])
-            found = loop.moved(at) if omega else loop.closed.GS.response(at)  # exact at rest
+            found = (
+                loop.force_responses(at) if omega else loop.closed.GS.response(at)
+            )  # exact at rest
             return float(np.linalg.norm(found[0], 2))
         G = row @ moved(omega)
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))

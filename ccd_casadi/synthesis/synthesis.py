@@ -35,7 +35,8 @@ class PoleOptions:
 
 
 class Outcome(StrEnum):
-    """How a synthesis ended. Only CERTIFIED designs are ever used; the value gives the reason."""
+    """The outcome of a synthesis. Only CERTIFIED designs are ever used; the value gives the
+    reason."""
 
     CERTIFIED = "certified"
     GAMMA_NOT_CONVERGED = "the search for gamma_opt did not converge"
@@ -69,7 +70,7 @@ class Outcome(StrEnum):
 
 
 class Optimum(StrEnum):
-    """What is known of γ_opt: a certified controller may be far from the best one."""
+    """The knowledge of γ_opt: a certified controller may be far from the best one."""
 
     FOUND = "found"
     UNKNOWN = (
@@ -105,7 +106,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class DesignFigures:
-    """What one synthesis gave; NaN where it ended before the figure was known.
+    """The figures of one synthesis; NaN where it ended before the figure was known.
 
     Attributes
     ----------
@@ -220,11 +221,11 @@ def synthesise(
     """
     w0 = plant.omega_0
     on = plant.design_plant
-    row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scaled(w0), on.grid, on.gain, gamma_backoff,
+    row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scale(w0), on.grid, on.gain, gamma_backoff,
                      omega_low / w0, guess, on.channels, weights.delta,
                      judged_on(plant))  # fmt: skip
     figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
-    refused = _refused(on)
+    refused = _refusal(on)
     if refused is Outcome.NOT_STABILISABLE and not figures.certificate.passed:
         figures = replace(figures, outcome=refused, gamma_opt=np.nan)
     if refused is Outcome.POLE_ON_AXIS and not weights.delta:
@@ -235,8 +236,8 @@ def synthesise(
     return Design(figures, weights, controller)
 
 
-def _refused(plant: ScaledPlant, options: PoleOptions = PoleOptions()) -> Outcome | None:
-    """Why mixed sensitivity does not serve a plant, by its poles."""
+def _refusal(plant: ScaledPlant, options: PoleOptions = PoleOptions()) -> Outcome | None:
+    """Explain why mixed sensitivity does not serve a plant, by its poles."""
     poles = np.linalg.eigvals(plant.A)
     growing = poles[poles.real >= 0.0]
     if not len(growing):
@@ -285,7 +286,7 @@ def sweep(
         made = (synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff,
                            compliance=compliance) for point in points)  # fmt: skip
         return [design.figures for design in made]
-    rows = _sweep(on.A, on.B, on.C, weights.scaled(w0), S / w0, T / w0, on.grid, on.gain,
+    rows = _sweep(on.A, on.B, on.C, weights.scale(w0), S / w0, T / w0, on.grid, on.gain,
                   gamma_backoff, omega_low / w0, on.channels, weights.delta,
                   judged_on(plant))  # fmt: skip
     rows = rows.reshape(len(points), -1)
@@ -313,7 +314,7 @@ def over_family(
     w0 = plant.omega_0
     if row[Column.CODE] != Code.CERTIFIED or len(plant.members) == 1:
         return figures_from_row(row, weights, w0), plant
-    w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
+    w, Dk = weights.scale(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
     def assessed(member: ScaledPlant, gamma: float) -> Array:
         own = row.copy()

@@ -56,7 +56,7 @@ class Weights:
         """The same weights with other break frequencies, rad/s."""
         return replace(self, omega_S=omega_S, omega_T=omega_T)
 
-    def scaled(self, omega_0: float) -> NDArray[np.float64]:
+    def scale(self, omega_0: float) -> NDArray[np.float64]:
         """The vector that the kernels take: frequencies over ω₀, M_K absorbed in the force."""
         return np.array(
             [

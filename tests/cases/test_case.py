@@ -157,7 +157,7 @@ def test_a_resolved_case_finds_its_plant_from_another_folder(plant_folder: Path)
         ({"function": "my_plant.py:model", "a": [2**63]}, "plant.a", "write it as a float"),
     ],
 )
-def test_a_wrong_plant_function_is_told(
+def test_a_wrong_plant_function_is_reported(
     plant_folder: Path, plant: dict[str, Any], key: str, remedy: str
 ) -> None:
     path = plant_folder / "x.toml"
@@ -174,7 +174,9 @@ def test_a_wrong_plant_function_is_told(
         ("not_callable", "defines no function not_callable; check plant.function"),
     ],
 )
-def test_a_plant_function_that_fails_is_told(plant_folder: Path, function: str, words: str) -> None:
+def test_a_plant_function_that_fails_is_reported(
+    plant_folder: Path, function: str, words: str
+) -> None:
     document = edited(("plant", {"function": f"my_plant.py:{function}"}))
     case = parse_case(document, plant_folder / "x.toml")
     with pytest.raises(CaseError) as caught:
@@ -253,7 +255,7 @@ def test_another_package_offers_a_plant_by_its_entry_point(
         def load(self) -> object:
             return build
 
-    monkeypatch.setattr(registry, "_offered", lambda: {"pair": Point()})
+    monkeypatch.setattr(registry, "_offer", lambda: {"pair": Point()})
     registry.model_named.cache_clear()
     try:
         problem = problem_of(parse_case(edited(("plant", {"model": "pair"})), tmp_path / "x.toml"))

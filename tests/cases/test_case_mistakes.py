@@ -121,7 +121,7 @@ MISTAKES: list[tuple[str, Any, str, str]] = [
     MISTAKES,
     ids=[f"{number}-{mistake[0]}" for number, mistake in enumerate(MISTAKES)],
 )
-def test_a_mistake_is_told_with_its_key_and_its_remedy(
+def test_a_mistake_is_reported_with_its_key_and_its_remedy(
     change: str, value: Any, key: str, remedy: str
 ) -> None:
     text = message(edited((change, value)))
@@ -135,7 +135,7 @@ def test_a_key_that_holds_line_ends_or_escapes_stays_on_one_line() -> None:
 
 
 @pytest.mark.parametrize(("low", "rate"), [(6.0, 10.0), (5.0, 10.0), (1.0, 0.5)])
-def test_a_bound_above_half_the_rate_is_told_with_both_numbers(low: float, rate: float) -> None:
+def test_a_bound_above_half_the_rate_is_reported_with_both_numbers(low: float, rate: float) -> None:
     sections = ("controller", {"structure": "sections", "biquads": 0, "weighted_level": 9.0})
     text = message(edited(sections, ("loop.rate_hz", rate), ("inner.omega_low_hz", low)))
     words = f"is {low:g}, not below {0.5 * rate:g}, half of loop.rate_hz = {rate:g}; lower it"
@@ -163,7 +163,9 @@ def test_a_long_value_is_cut() -> None:
         (b"", "plant: is missing; add a table [plant]"),
     ],
 )
-def test_a_broken_file_is_told_with_the_place(tmp_path: Path, content: bytes, words: str) -> None:
+def test_a_broken_file_is_reported_with_the_place(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
     path = tmp_path / "broken.toml"
     path.write_bytes(content)
     with pytest.raises(CaseError) as caught:

@@ -79,7 +79,7 @@ HIDDEN = (
 THREE = GOOD + "|{'mass': M, 'stiffness': K, 'input': ca.DM([1,0,0]), 'output': ca.DM([[1,0,0]])}"
 
 
-def test_a_hidden_mode_is_told_by_its_frequency(
+def test_a_hidden_mode_is_reported_by_its_frequency(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two equal masses on equal springs, seen from the third: their opposed motion is hidden."""
@@ -97,7 +97,7 @@ def test_a_hidden_mode_is_told_by_its_frequency(
     assert "not driven" not in capsys.readouterr().out
 
 
-def test_a_rigid_motion_that_no_input_drives_is_told(
+def test_a_rigid_motion_that_no_input_drives_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     free = GOOD + "|{'stiffness': 0 * chain}"
@@ -107,7 +107,7 @@ def test_a_rigid_motion_that_no_input_drives_is_told(
     )
 
 
-def test_zeros_and_the_bandwidth_to_expect_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_zeros_and_the_bandwidth_to_expect_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert check([str(ROOT / "runs" / "two_mass.toml"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     # two equal masses: the antiresonance is that of one on the spring, the resonance √2 above
@@ -138,7 +138,7 @@ def test_a_zero_in_the_right_half_plane_is_a_warning(tmp_path: Path) -> None:
     assert sum("right half-plane" in text for text in words) == 1
 
 
-def test_solve_tells_what_is_serious_unless_it_is_quiet(
+def test_solve_reports_what_is_serious_unless_it_is_quiet(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = case_file(tmp_path, THREE, before=HIDDEN)
@@ -152,7 +152,7 @@ def test_solve_tells_what_is_serious_unless_it_is_quiet(
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_an_undamped_mode_is_told_by_its_frequency(
+def test_an_undamped_mode_is_reported_by_its_frequency(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     undamped = GOOD.replace("'damping_ratio': 0.01", "'damping': DAMPING")
@@ -202,7 +202,7 @@ def test_eigenvectors_whose_sign_flips_are_an_error_by_name(tmp_path: Path) -> N
         (("S_max = 1.75", "S_max = 6.0"), "was 6 dB meant? Then write 1.995"),
     ],
 )
-def test_what_looks_like_another_unit_is_told(
+def test_what_looks_like_another_unit_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], words: str
 ) -> None:
     path = case_file(tmp_path, GOOD)
@@ -215,7 +215,7 @@ def test_what_looks_like_another_unit_is_told(
     assert words in capsys.readouterr().out
 
 
-def test_a_stiffness_in_newton_per_micrometre_is_told(
+def test_a_stiffness_in_newton_per_micrometre_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = case_file(tmp_path, GOOD.replace("2e8 * chain", "200.0 * chain"))
@@ -232,7 +232,7 @@ def test_a_stiffness_in_newton_per_micrometre_is_told(
         ('        "mass": ', 1e3, "and of mass and stiffness"),  # g
     ],
 )
-def test_a_new_stage_in_another_unit_is_told(
+def test_a_new_stage_in_another_unit_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, factor: float, words: str
 ) -> None:
     """What `ccd new` writes has none; its stiffness in N/mm or its masses in g have one."""
@@ -262,7 +262,7 @@ GRAMS = GOOD.replace("vertcat(m1, m2)", "vertcat(1e3 * m1, 1e3 * m2)")
         (GOOD.replace("2e8", "m1"), "N/mm", "and stiffness grows by 1 with each, where 1000 is"),
     ],
 )
-def test_a_matrix_in_the_unit_of_its_parameter_is_told(
+def test_a_matrix_in_the_unit_of_its_parameter_is_reported(
     tmp_path: Path, result: str, unit: str, words: str
 ) -> None:
     path = case_file(tmp_path, result)
@@ -347,7 +347,7 @@ def test_a_dip_names_M_K_only_where_the_case_states_one(tmp_path: Path) -> None:
         ("", "rate_hz = 4000.0\ndelay_us = 100.0", ""),
     ],
 )  # fmt: skip
-def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
+def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_reported(
     tmp_path: Path, more: str, loop: str, words: str
 ) -> None:
     path = case_file(tmp_path, GOOD + more)

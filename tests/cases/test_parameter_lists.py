@@ -60,7 +60,7 @@ def test_a_fixed_parameter_comes_back(tmp_path: Path) -> None:
         ({"values": [57, 60], "start": 70}, "70 is outside 57 to 60"),
     ],
 )
-def test_mistakes_about_lists_are_told(table: dict[str, Any], words: str) -> None:
+def test_mistakes_about_lists_are_reported(table: dict[str, Any], words: str) -> None:
     with pytest.raises(CaseError, match=words.replace("(", "\\(")):
         parse_case(document(**table))
 

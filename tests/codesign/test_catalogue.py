@@ -19,7 +19,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign import outer_structured
-from ccd_casadi.codesign.catalogue import best_of_lists, restricted
+from ccd_casadi.codesign.catalogue import best_of_lists, restrict
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer_problem import FormulationResult
@@ -69,7 +69,7 @@ def test_a_fixed_parameter_is_the_same_plant_with_less_theta(name: str, tmp_path
     whole = problem(source=source, names=names, units=("",) * len(names), start=values, **bounds)
     for held in names[:-1]:
         lists = {held: (theta[held],)}
-        part = restricted(whole, lists)
+        part = restrict(whole, lists)
         kept = [i for i, item in enumerate(names) if item != held]
         assert part.names == tuple(names[i] for i in kept)
         here = tuple(values[i] for i in kept)
@@ -92,7 +92,7 @@ def test_a_built_stage_with_a_fixed_length_is_drawn_and_differentiated() -> None
     source = replace(base.source, options=(*base.source.options, ("mesh", "coarse")))
     whole = replace(base, source=source)
     name = whole.names[1]
-    part = restricted(whole, {name: (whole.start[1],)})
+    part = restrict(whole, {name: (whole.start[1],)})
     kept = [i for i in range(len(whole.names)) if i != 1]
     here = tuple(whole.start[i] for i in kept)
     drawn = [
@@ -174,7 +174,7 @@ def all_listed(own: CoDesignProblem, solve: Any) -> list[Found]:
     every = itertools.product(*(values for _, values in own.listed))
     return [
         solve(
-            OneSampler(problem=restricted(own, {n: (v,) for n, v in zip(names, row, strict=True)}))
+            OneSampler(problem=restrict(own, {n: (v,) for n, v in zip(names, row, strict=True)}))
         )
         for row in every
     ]
@@ -330,9 +330,9 @@ def test_a_run_is_of_the_value_that_was_chosen(listed_run: Path) -> None:
     assert run.problem.source.held == {"m1": 57.0}
     assert any("m1 = 57 kg (of 3 values)" in words for words in result["notes"])
     alone = problem_of(load_case(TWO_MASS))
-    at_it = solve_problem(restricted(alone, {"m1": (57.0,)}), Lifted(points=24, box_points=4))
+    at_it = solve_problem(restrict(alone, {"m1": (57.0,)}), Lifted(points=24, box_points=4))
     assert result["objective"] == pytest.approx(at_it.result["objective"], rel=1e-6)
-    heavier = solve_problem(restricted(alone, {"m1": (61.0,)}), Lifted(points=24, box_points=4))
+    heavier = solve_problem(restrict(alone, {"m1": (61.0,)}), Lifted(points=24, box_points=4))
     assert result["objective"] < heavier.result["objective"]
 
 

@@ -45,7 +45,7 @@ def sound() -> Verified:
     """Case study 1 near its optimum, polished and judged, with nothing amiss."""
     with Workers(1) as workers, SampleStore(":memory:") as store:
         outer = outer_of(Sampler(problem(), store, workers))
-        return outer.verified(outer.polished(X), 1)
+        return outer.verify(outer.polish(X), 1)
 
 
 def verdict_of(verified: Verified) -> tuple[dict[str, str], str]:
@@ -116,10 +116,10 @@ def test_a_set_that_is_not_known_to_be_kept_is_not_passed(sound: Verified, own: 
 @pytest.mark.parametrize("learnt", [True, False])
 def test_a_prediction_that_was_not_met_is_not_passed(error: float, learnt: bool) -> None:
     quality: Any = SimpleNamespace(at_point=None, extrapolates=())
-    assert v.predicted(error, 1e-3, 300.0, BANDWIDTH, quality, learnt).state in UNPROVEN
-    assert v.predicted(0.0, 1e-3, 300.0, BANDWIDTH, None).state is v.State.UNKNOWN
+    assert v.judge_prediction(error, 1e-3, 300.0, BANDWIDTH, quality, learnt).state in UNPROVEN
+    assert v.judge_prediction(0.0, 1e-3, 300.0, BANDWIDTH, None).state is v.State.UNKNOWN
     left_out: Any = SimpleNamespace(at_point=(NAN, NAN), extrapolates=())
-    assert v.predicted(0.0, 1e-3, 300.0, BANDWIDTH, left_out).state in UNPROVEN
+    assert v.judge_prediction(0.0, 1e-3, 300.0, BANDWIDTH, left_out).state in UNPROVEN
 
 
 @pytest.mark.parametrize("delay", [NAN, math.inf])
@@ -149,7 +149,7 @@ def test_a_figure_of_the_judge_that_is_nan_fails_it(
     plant = StateSpace(*np.ones((4, 1, 1)))
     for place in range(3):
         each = [lost if i == place else sound for i in range(3)]
-        monkeypatch.setattr(certificate, "judged", lambda *_, each=each: each)
+        monkeypatch.setattr(certificate, "judge_plants", lambda *_, each=each: each)
         found = certificate.certify([plant] * 3, plant, bounds)
         assert found.passed is not matter
 
@@ -169,7 +169,7 @@ def test_slicot_that_fails_is_no_confirmation(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(second_engine.slycot, "ab13dd", answer)
         with Workers(1) as workers, SampleStore(":memory:") as store:
             outer = outer_of(Sampler(problem(), store, workers))
-            assert verdict_of(outer.verified(outer.polished(X), 1))[0]["certified"] in states
+            assert verdict_of(outer.verify(outer.polish(X), 1))[0]["certified"] in states
 
 
 def test_a_challenge_that_finds_nothing_is_no_gap_of_zero(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,7 @@ def test_a_challenge_that_finds_nothing_is_no_gap_of_zero(monkeypatch: pytest.Mo
         sampler = Sampler(problem(), store, workers)
         nothing = replace(sampler.values(X[:2])[0], bandwidth=NAN)
         monkeypatch.setattr(Sampler, "values", lambda *_: [nothing])
-        end = outer_mixed.MixedOuter(sampler).polished(X)
+        end = outer_mixed.MixedOuter(sampler).polish(X)
     assert math.isnan(end.gap)
     lost: Any = SimpleNamespace(feasible=False)
     assert math.isnan(outer_structured._gap(problem(), lost, lost))

@@ -17,7 +17,7 @@ from ccd_casadi.inner_problem.objective import (
     TrueQuantities,
     binding,
     constraint_shares,
-    violated,
+    violations,
 )
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -64,7 +64,7 @@ def test_what_is_met_and_what_is_active_is_the_same_in_every_unit(
         shares = constraint_shares(case, theta)
         assert shares[0] == pytest.approx(share, rel=1e-3, abs=1e-13)
         assert shares[1] == pytest.approx((theta[0] - theta[1]) / 30.0, rel=1e-9, abs=1e-13)
-        found.append((violated(case, theta), binding(case, theta)))
+        found.append((violations(case, theta), binding(case, theta)))
     assert found[0] == found[1] == found[2]
     assert ("least mass" in found[0][0]) == (share > ConstraintOptions.met)
     assert ("least mass" in found[0][1]) == (share >= -ConstraintOptions.active)

@@ -57,7 +57,7 @@ def test_a_range_is_reached_from_the_plant_alone(tmp_path) -> None:  # type: ign
         assert not TrueDesign(sampler.truth, x).acceptable
         reached, share = widen(sampler, x)
         assert 0.0 < share <= 1.0
-        held = replace(case, robust=OPEN.scaled(share) if case.robust else None)
+        held = replace(case, robust=OPEN.scale(share) if case.robust else None)
         held = replace(held, robust=replace(held.robust, design_shift=-0.02 * share))
         assert TrueDesign(Sampler(held, store, pool).truth, reached).acceptable
 

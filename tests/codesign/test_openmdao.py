@@ -64,7 +64,7 @@ def test_the_partials_of_a_synthesis_are_exact(compliance_max: float | None) -> 
         assert found.get_val(name).item() == pytest.approx(getattr(figures, name), rel=1e-9)
 
 
-def test_a_plant_gives_its_constraints_and_a_model_is_told_the_bounds() -> None:
+def test_a_plant_gives_its_constraints_and_a_model_is_reported_the_bounds() -> None:
     required = ccd.problem_of(ccd.load_case(ROOT / "examples/three_mass_axis/case.toml"))
     found = om.Problem(reports=False)
     found.model.add_subsystem("loop", CertifiedLoop(problem=required), promotes=["*"])

@@ -112,8 +112,8 @@ def test_a_verification_synthesises_every_design_once(
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(), store, Workers(1))
         outer = MixedOuter(sampler)
-        end = outer.polished(at((62.0, 64.0, 500.0, 45.0)))
+        end = outer.polish(at((62.0, 64.0, 500.0, 45.0)))
         global_check(outer, end, 4, 0)
-        verified = outer.verified(end, 1)
+        verified = outer.verify(end, 1)
     assert verified.feasible
     assert len(set(required)) == len(required)

@@ -143,7 +143,7 @@ def test_near_duplicates_are_fitted_once(tmp_path: Path) -> None:
         lower, upper = outer.bounds
         X = sobol(lower, upper, 16, 0)
         outer.sampler.quantities(np.vstack([X, X + 3e-5 * (upper - lower) * (upper - 1.0 > X)]))
-        known = Job(tmp_path, CASE, outer, "lifted", 0)._known()
+        known = Job(tmp_path, CASE, outer, "lifted", 0)._read_known()
     assert known is not None
     assert len(known) <= 16
     np.testing.assert_allclose([s.x for s in known], X[: len(known)], rtol=1e-9)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
 from ccd_casadi.analysis.loop_channels import sampled_figures
-from ccd_casadi.codesign.final_judgement import OtherDamping, survived
+from ccd_casadi.codesign.final_judgement import OtherDamping, judge_survival
 from ccd_casadi.codesign.survival import (
     PEAK,
     LoopsOffModel,
@@ -27,7 +27,7 @@ from ccd_casadi.codesign.survival import (
 from ccd_casadi.codesign.verdict import State, survives
 from ccd_casadi.codesign.verified_mixed import set_findings
 from ccd_casadi.inner_problem.controller_problem import RobustSet
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
@@ -224,7 +224,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
         A = np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]])
         B, C = np.vstack([empty, modal.B]), np.hstack([modal.C, empty.T])
         G = StateSpace(A, B, C, np.zeros((1, 1)))
-        figures = sampled_figures(closed_loop(sampled(G, sampling.period, sampling.delay), K).S)
+        figures = sampled_figures(closed_loop(zoh(G, sampling.period, sampling.delay), K).S)
         return figures.stable, figures.sensitivity_peak
 
     low, high = found.S_max_shift
@@ -252,7 +252,8 @@ def test_neither_the_set_nor_the_range_denies_the_other(
     loops, S_max = loops_and_bound(case, seed)
     whole = problem(robust=RobustSet(reach, 5, factors, 0.0))
     whole = replace(whole, inner=replace(whole.inner, S_max=S_max))
-    found, check = survived(whole, loops, SimpleNamespace(certified=True, bandwidth=CROSSOVER))
+    design = SimpleNamespace(certified=True, bandwidth=CROSSOVER)
+    found, check = judge_survival(whole, loops, design)
     assert check is not None
     within = found.within(-reach, reach)
     assert check.passed <= within
@@ -287,7 +288,7 @@ def test_other_damping_is_that_of_the_plant_given_the_other_way(
         np.testing.assert_allclose(one.modal(off).K, own.K, rtol=1e-12)
 
 
-def test_what_the_other_damping_would_pass_is_told() -> None:
+def test_what_the_other_damping_would_pass_is_reported() -> None:
     reported = OtherDamping("matrix", {"S_max": 1.0, "KS": 0.2}, {"S_max": 1.036, "KS": 0.5})
     assert "with the damping ratio kept instead of the matrix: S by 3.6 %" in reported.words
     assert "KS" not in reported.words

@@ -12,14 +12,14 @@ from oracles.shipped_designs import RESULTS
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
-from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint, proposed
+from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint, propose_step
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.theta_joint import (
     JointSearchOptions,
     joint_search,
     objectives_beside,
-    polled,
+    poll,
 )
 from ccd_casadi.codesign.working_set import WorkingSet, WorkingSetOptions
 from ccd_casadi.fixed_structure.figures import assess, hessians
@@ -127,7 +127,9 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         first = sampler.values(np.array(problem.start))[0]
         at = JointPoint(first.theta, first.kappa, first.bandwidth)
         models = nearby(problem, [at.theta], at.theta)
-        promised, whole = (proposed(problem, models, at, 0.05, least) for least in (None, 1e-10))
+        promised, whole = (
+            propose_step(problem, models, at, 0.05, least) for least in (None, 1e-10)
+        )
         assert promised.gain > 0.8 * whole.gain > 0.0
         _, best, settled = joint_search(sampler, np.array(problem.start))
         assert settled
@@ -160,10 +162,10 @@ def test_a_poll_has_the_best_place_along_the_axes(theta: tuple[float, float]) ->
         for sign in (1.0, -1.0)
     ]
     places = [place for step in steps if ((place := theta + step) >= problem.lower).all()]
-    J = [JointModel(problem, models, replace(at, theta=tuple(place)), 0.0).adapted()[1]
+    J = [JointModel(problem, models, replace(at, theta=tuple(place)), 0.0).adapt()[1]
          for place in places]  # fmt: skip
     assert np.isfinite(J).any()
-    assert polled(problem, models, at).theta == pytest.approx(places[int(np.argmin(J))])
+    assert poll(problem, models, at).theta == pytest.approx(places[int(np.argmin(J))])
 
 
 @pytest.mark.slow
@@ -248,7 +250,7 @@ def test_a_working_set_keeps_the_model_as_its_first_plant(tmp_path: Path) -> Non
     at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * STORED["bandwidth_hz"])
     with SampleStore(tmp_path / "samples.sqlite") as store:
         working = WorkingSet(Sampler(problem, store, Workers(1)))
-        few = working.reduced(nearby(problem, (), theta), at, WorkingSetOptions(most_plants=1))
+        few = working.reduce(nearby(problem, (), theta), at, WorkingSetOptions(most_plants=1))
     left = state_of(few.sampler.problem).scenarios
     assert left[0] == (0, tuple(map(float, uncertain_plant(problem, theta).nominal)))
     assert left[0] not in few.aside

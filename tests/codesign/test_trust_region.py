@@ -24,7 +24,7 @@ class Smooth(TrustRegionModel[Array]):
     def __init__(
         self, Q: Array, a: Array, b: Array, A: Array, R: Array, *, learn: Update | None = None
     ) -> None:
-        self.Q, self.a, self.b, self.A, self.R, self.learn = Q, a, b, A, R, learn
+        self.Q, self.a, self.b, self.A, self.R, self.rule = Q, a, b, A, R, learn
         self.low, self.high = np.full(len(a), -WIDE), np.full(len(a), WIDE)
         self.hole, self.size, self.missed = np.zeros(len(a)), 0.0, 0
         self.seen: list[Array] = []
@@ -40,24 +40,24 @@ class Smooth(TrustRegionModel[Array]):
 
     def rows(self, here: Iterate[Array], radius: float) -> Rows:
         slopes = self.A + self.R @ here.x
-        if self.learn is damped_bfgs:
+        if self.rule is damped_bfgs:
             return Rows(here.data, slopes)
         return Rows(here.data, slopes, hessians=lambda i: self.R[i], curved=len(slopes))
 
-    def learnt(
+    def learn(
         self, H: Array, here: Iterate[Array], there: Iterate[Array], step: Step, radius: float
     ) -> Array:
-        if self.learn is None:
+        if self.rule is None:
             return H
         change = there.gradient - here.gradient
-        if self.learn is damped_bfgs:
+        if self.rule is damped_bfgs:
             change = change + (self.R @ (there.x - here.x)).T @ step.multipliers
-        return self.learn(H, there.x - here.x, change)
+        return self.rule(H, there.x - here.x, change)
 
     def run(self, x: Array, penalty: float = 100.0) -> Minimum[Array]:
         start = self.at(x)
         assert start is not None
-        H = np.eye(len(x)) if self.learn else self.Q
+        H = np.eye(len(x)) if self.rule else self.Q
         return minimise(self, start, H, Radius(0.5, 1e-12, 4.0), steps=300, penalty=penalty,
                         least_gain=1e-13)  # fmt: skip
 

@@ -18,7 +18,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.final_judgement import survived
+from ccd_casadi.codesign.final_judgement import judge_survival
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
@@ -101,7 +101,7 @@ def test_the_look_at_the_box_is_said() -> None:
 
 
 @given(st.floats(1e-2, 1e4), st.floats(1e-3, 0.5))
-def test_the_ends_of_a_search_are_told_apart(first: float, share: float) -> None:
+def test_the_ends_of_a_search_are_reported_apart(first: float, share: float) -> None:
     """Of a slow loop too, to four digits at least."""
     ends = [first, first * (1.0 - share)]
     words = Reason.MULTISTART(local_optima_hz=ends).words()
@@ -182,7 +182,7 @@ def predicted(
 ) -> v.Check:
     """Of a bandwidth, by a surrogate."""
     quality: Any = SimpleNamespace(at_point=left_out, extrapolates=())
-    return v.predicted(error, 1e-3, value, BANDWIDTH, quality)
+    return v.judge_prediction(error, 1e-3, value, BANDWIDTH, quality)
 
 
 def test_a_prediction_at_its_own_sample_counts_without_it() -> None:
@@ -210,7 +210,7 @@ def corner_design() -> tuple[Survival, float]:
         omega_low=problem().inner.omega_low,
     )
     loops = loops_of(problem(), CORNER, made.controller)
-    found = survived(problem(), loops, made.figures)[0]
+    found = judge_survival(problem(), loops, made.figures)[0]
     assert found is not None
     return found, made.figures.bandwidth
 

@@ -80,7 +80,7 @@ def test_samples_of_a_callable_are_of_one_problem() -> None:
     assert first["plant"] != again["plant"]
 
 
-def test_its_faults_are_told_with_line_and_name() -> None:
+def test_its_faults_are_reported_with_line_and_name() -> None:
     def boom(theta: Mapping[str, Any], k: float) -> None:
         raise ValueError("no such beam")
 

@@ -201,7 +201,7 @@ def test_a_reader_that_went_away_is_no_noise(body: str, code: ExitCode) -> None:
     assert (process.returncode, err) == (code, "")
 
 
-def test_run_folder_is_beside_the_case_or_where_it_is_asked_for(tmp_path: Path) -> None:
+def test_run_folder_is_beside_the_case_or_where_it_is_required(tmp_path: Path) -> None:
     assert run_folder(tmp_path / "x.toml", None) == tmp_path / "x"
     assert run_folder(tmp_path / "x.toml", tmp_path / "a" / "b") == tmp_path / "a" / "b"
     assert run_folder(tmp_path / "x.toml", None).is_dir()  # again: it may exist
@@ -209,7 +209,7 @@ def test_run_folder_is_beside_the_case_or_where_it_is_asked_for(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["file", "file/below", "x" * 300])
-def test_a_run_folder_that_cannot_be_made_is_told(tmp_path: Path, name: str) -> None:
+def test_a_run_folder_that_cannot_be_made_is_reported(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError) as caught:
         run_folder(tmp_path / "x.toml", tmp_path / name)

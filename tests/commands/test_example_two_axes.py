@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.fixed_structure.local_search import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.reporting.facts import channel_words
 from ccd_casadi.sampling.inner_samples import InnerSample
@@ -41,7 +41,7 @@ def case(tilt: dict[str, float] | None = None) -> dict[str, Any]:
 
 @cache
 def as_shipped() -> tuple[CoDesignProblem, SectionsDesign]:
-    return prepared(problem_of(parse_case(case(), CASE)))[:2]
+    return prepare_search(problem_of(parse_case(case(), CASE)))[:2]
 
 
 def test_the_figures_of_the_readme() -> None:

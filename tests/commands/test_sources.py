@@ -71,7 +71,7 @@ def test_no_source_reads_code_from_data() -> None:
     assert "json.loads" in seen, "the scan sees calls"
 
 
-def test_plant_files_are_loaded_where_permission_is_asked() -> None:
+def test_plant_files_are_loaded_where_permission_is_required() -> None:
     loading = {p.relative_to(ROOT).as_posix() for p in SOURCES if "exec_module" in p.read_text()}
     assert loading == {"ccd_casadi/inner_problem/plant_source.py"}
     text = (ROOT / "ccd_casadi" / "inner_problem" / "plant_source.py").read_text()

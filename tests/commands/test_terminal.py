@@ -10,7 +10,7 @@ import termios
 import pytest
 
 import ccd_casadi
-from ccd_casadi.support.terminal import Progress, coloured, wrapped
+from ccd_casadi.support.terminal import Progress, colour_line, wrap
 
 
 def on_screen(columns: int, *words: str) -> list[str]:
@@ -56,7 +56,7 @@ def test_the_table_of_back_ends_holds_80_characters() -> None:
 
 def test_a_line_goes_on_under_its_words() -> None:
     line = "survives      warned   stable for resonances -0.76 to +7.9 %, less than +-2 %"
-    broken = wrapped(line, 50).split("\n")
+    broken = wrap(line, 50).split("\n")
     assert all(part.startswith(" " * 23) for part in broken[1:])
     assert " ".join(" ".join(broken).split()) == " ".join(line.split())
 
@@ -64,9 +64,9 @@ def test_a_line_goes_on_under_its_words() -> None:
 def test_the_state_of_a_line_has_its_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
-    assert coloured("survives      warned   so") == "survives      \x1b[33mwarned\x1b[0m   so"
+    assert colour_line("survives      warned   so") == "survives      \x1b[33mwarned\x1b[0m   so"
     monkeypatch.setenv("NO_COLOR", "1")
-    assert coloured("survives      warned   stable") == "survives      warned   stable"
+    assert colour_line("survives      warned   stable") == "survives      warned   stable"
 
 
 def test_work_that_ends_early_ends_its_bar(capsys: pytest.CaptureFixture[str]) -> None:

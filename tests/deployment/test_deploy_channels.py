@@ -21,14 +21,14 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.deploy_files import deployment_dict
 from ccd_casadi.deployment.outcome import DeployedRun, Deployment
-from ccd_casadi.deployment.pipeline import _judged, deploy
+from ccd_casadi.deployment.pipeline import _judge, deploy
 from ccd_casadi.deployment.robust_set import as_written, members
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_search import with_range
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.reporting.deploy_page import deploy_page
 from ccd_casadi.solve import main as solve_main
@@ -159,7 +159,7 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
     z, k = np.exp(1j * HZ * T), K.response(np.array([HZ]))[0]
     at_low = 0.0
     for plant in as_written(run):  # |S(ω_low)| over S_low by the exact hold and delay
-        G = sampled(plant, T, 60e-6)
+        G = zoh(plant, T, 60e-6)
         g = G.C @ np.linalg.solve(z * np.eye(len(G.A)) - G.A, G.B) + G.D
         at_low = max(at_low, np.linalg.norm(np.linalg.inv(np.eye(2) + g @ k), 2))
     S_low = run.problem.inner.S_low * (1.0 + found.target.excess)
@@ -168,22 +168,22 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
     for share, state in ((1.01, State.PASSED), (0.3, State.WARNED)):
         other = replace(run.problem.controller, weighted_level=share * largest)
         of_other = replace(run, problem=replace(run.problem, controller=other))
-        again = replace(found, judge=_judged(of_other, found))
+        again = replace(found, judge=_judge(of_other, found))
         assert DeployedRun(run, again).check().state == state, again.weighted_above
         assert any("3.33 times weighted_level" in one.words() for one in again.weighted_above) == (
             share < 1.0
         )
     wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))
-    assert _judged(run, replace(found, realisation=wrong)).passed is False
+    assert _judge(run, replace(found, realisation=wrong)).passed is False
     for share, passed in ((1.001, True), (0.999, False)):
         target = replace(found.target, S_max=share * worst / (1.0 + found.target.excess))
-        assert _judged(run, replace(found, target=target)).passed is passed
+        assert _judge(run, replace(found, target=target)).passed is passed
     assert {getattr(item.at, "option", 0) for item in found.members} == {0, 1}
     uncertain = uncertain_plant(run.problem, run.theta)
     for option in (0, 1):  # in between, by plants of one's own
         for gain in (-0.02, 0.007, 0.02):
             plant = uncertain.plant(np.array([gain]), option).plant_si()
-            held = sampled(plant, 1.0 / 8000.0, 60e-6)
+            held = zoh(plant, 1.0 / 8000.0, 60e-6)
             figures = sampled_figures(closed_loop(held, found.realisation.system).S)
             assert figures.stable
             assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
@@ -192,7 +192,7 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
     assert "Channel difference: 3 states, as designed" in page
 
 
-def test_one_channel_that_is_too_fast_is_told(tmp_path: Path) -> None:
+def test_one_channel_that_is_too_fast_is_reported(tmp_path: Path) -> None:
     found = deploy(run_by_hand(tmp_path, harder=4.0), Timing())
     assert not found.passed
     assert found.worst.badness > found.target.peak

@@ -16,7 +16,7 @@ from ccd_casadi.deployment.given_controller import with_controller
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import DeploymentOptions, deploy
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
@@ -59,7 +59,7 @@ def peaks(run: FinishedRun, found, shifts) -> list[float]:  # type: ignore[no-un
     for shift in shifts:
         modal = modal_plant(system, run.problem.suspension.free, Perturbation(float(shift)))
         plant = scale_plant(modal, run.weights.M_K).plant_si()
-        held = sampled(plant, 1.0 / found.rate_hz, found.delay)
+        held = zoh(plant, 1.0 / found.rate_hz, found.delay)
         figures = sampled_figures(closed_loop(held, found.realisation.system).S)
         out.append(figures.sensitivity_peak if figures.stable else np.inf)
     return out
@@ -79,7 +79,7 @@ def test_what_is_verified_holds_between_the_plants_too(
     assert {item.at.shift for item in found.members} >= {-0.02, 0.02}
 
 
-def test_a_bound_on_the_compliance_is_kept_or_told(
+def test_a_bound_on_the_compliance_is_kept_or_reported(
     deployed: tuple[FinishedRun, Deployment],
 ) -> None:
     run, found = deployed
@@ -114,7 +114,7 @@ def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(
     assert failed > 0
 
 
-def test_a_run_that_is_not_verified_is_refused_unless_asked(
+def test_a_run_that_is_not_verified_is_refused_unless_required(
     robust_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = Path(shutil.copytree(robust_run, tmp_path / "run"))

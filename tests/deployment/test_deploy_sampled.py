@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from ccd_casadi.analysis.loop_channels import SampledFigures, sampled_figures, worst_figures
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 
 HZ = 2.0 * np.pi
@@ -38,7 +38,7 @@ def lead(channels: int = 1) -> StateSpace:
 
 def loop(period: float, delay: float, channels: int = 1) -> StateSpace:
     K = discretise(lead(channels), Conversion.LEAD, period, delay)
-    return closed_loop(sampled(stage(channels), period, delay), K).S
+    return closed_loop(zoh(stage(channels), period, delay), K).S
 
 
 @few(max_examples=25)
@@ -53,7 +53,7 @@ def test_the_sampled_plant_is_the_plant(seed: int, steps: int, part: int, states
     B, C = rng.normal(size=(states, 2)), rng.normal(size=(2, states))
     period = 0.3
     delay = period * (steps + part / 20)
-    found = sampled(StateSpace(A, B, C, np.zeros((2, 2))), period, delay)
+    found = zoh(StateSpace(A, B, C, np.zeros((2, 2))), period, delay)
     u = rng.normal(size=(12, 2))
     joint = np.zeros((states + 2, states + 2))
     joint[:states] = np.hstack([A, B])
@@ -101,7 +101,7 @@ def test_an_unstable_loop_has_no_figures() -> None:
 def test_a_simulation_measures_the_same_sensitivity(channels: int) -> None:
     period, delay = 3e-3, 4.2e-3
     conversion = Conversion.TUSTIN
-    G = sampled(stage(channels), period, delay)
+    G = zoh(stage(channels), period, delay)
     K = discretise(lead(channels), conversion, period, delay)
     S = closed_loop(G, K).S
     exact = sampled_figures(S)
@@ -119,8 +119,8 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     both = worst_figures([one, sampled_figures(loop(period, 2.0 * delay))])
     K = discretise(lead(), Conversion.LEAD, period, delay)
     slow = discretise(lead(), Conversion.LEAD, period, 2.0 * delay)
-    S1 = closed_loop(sampled(stage(), period, delay), K).S
-    S2 = closed_loop(sampled(stage(), period, 2.0 * delay), slow).S
+    S1 = closed_loop(zoh(stage(), period, delay), K).S
+    S2 = closed_loop(zoh(stage(), period, 2.0 * delay), slow).S
     zero = np.zeros((len(S1.A), len(S2.A)))
     whole = sampled_figures(StateSpace(
         np.block([[S1.A, zero], [zero.T, S2.A]]),
@@ -171,7 +171,7 @@ def test_needed_rate(met: Callable[[float], bool], found: float | None) -> None:
 
 
 def test_a_simulation_goes_on_from_its_state() -> None:
-    G = sampled(stage(), 1e-3, 1e-3)
+    G = zoh(stage(), 1e-3, 1e-3)
     K = discretise(lead(), Conversion.LEAD, 1e-3, 1e-3)
     r = np.random.default_rng(0).normal(size=(60, 1, 1))
     whole, _ = simulate(G, K, r)

@@ -17,9 +17,9 @@ from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.fixed_point import FixedRequest, Ranges, in_fixed
 from ccd_casadi.deployment.integer_loop import rounding_bound
-from ccd_casadi.deployment.realisation import Realisation, difference_equation, realised
+from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise_blocks
 from ccd_casadi.deployment.source_code import COMPILE, write_c
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import UserError
 
@@ -37,7 +37,7 @@ def stage(seed: int) -> tuple[StateSpace, Realisation]:
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-modes, -np.diag([0.0, 0.02 * HZ * hz])]])
     b = np.array([1.0, np.sqrt(share)]) / np.sqrt(mass)
     B, C = np.r_[np.zeros(2), b][:, None], np.r_[b, np.zeros(2)][None]
-    G = sampled(StateSpace(A, B, C, np.zeros((1, 1))), T, T)
+    G = zoh(StateSpace(A, B, C, np.zeros((1, 1))), T, T)
     wc = HZ * rng.uniform(20.0, 60.0)
     notch = [1.0, HZ * hz, (HZ * hz) ** 2]
     sections = [([1.0, wc / 10.0], [1.0, 0.0]), ([3.0, wc], [1.0 / 3.0, wc]),
@@ -47,7 +47,7 @@ def stage(seed: int) -> tuple[StateSpace, Realisation]:
     K = StateSpace(*(np.zeros(s) for s in ((0, 0), (0, 1), (1, 0))), np.array([[gain]]), period=T)
     for section in sections:
         K = K.series(StateSpace(*signal.tf2ss(*signal.bilinear(*section, fs=1.0 / T)), period=T))
-    return G, realised(K)
+    return G, realise_blocks(K)
 
 
 def ranges_in(G: StateSpace, r: Realisation, forces: np.ndarray) -> Ranges:
@@ -119,7 +119,7 @@ def test_a_slow_pole_keeps_its_distance_from_one() -> None:
     slow = StateSpace(np.array([[1.0 - 3.3e-7]]), np.array([[1e-3]]), np.array([[1e6]]),
                       np.array([[1e6]]), period=T)  # fmt: skip
     ranges = Ranges(np.ones(1), np.array([1e-3]), np.array([1e6]))
-    found = in_fixed(realised(slow), ranges, FixedRequest(16, MOVES))
+    found = in_fixed(realise_blocks(slow), ranges, FixedRequest(16, MOVES))
     pole = float(found.system.A[0, 0])
     assert (1.0 - pole) / 3.3e-7 == pytest.approx(1.0, abs=2.0**-14)
 

@@ -12,7 +12,7 @@ from test_deploy_code import of_one_channel, random_controller
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, with_anti_windup
 from ccd_casadi.deployment.source_code import c_files
-from ccd_casadi.extensions.formats.code_formats import FLAGS, compiled, write_fmu
+from ccd_casadi.extensions.formats.code_formats import FLAGS, compile_library, write_fmu
 from ccd_casadi.support.errors import UserError
 
 fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
@@ -125,11 +125,11 @@ def test_without_a_compiler_the_sources_are_there(
 def test_a_compiler_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CC", raising=False)
     with pytest.raises(UserError, match="does not compile the FMU"):
-        compiled({"controller.c": "int x"})
+        compile_library({"controller.c": "int x"})
 
 
 @with_compiler
-def test_deploy_leaves_one_when_asked(two_mass_run: Path, tmp_path: Path) -> None:
+def test_deploy_leaves_one_when_required(two_mass_run: Path, tmp_path: Path) -> None:
     options = [str(two_mass_run), "--rate-hz", "16000", "--quiet"]
     assert main([*options, "--out", str(tmp_path / "with"), "--fmu"]) == 0
     assert not validate_fmu(str(tmp_path / "with/controller.fmu"))

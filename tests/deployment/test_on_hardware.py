@@ -37,7 +37,7 @@ from ccd_casadi.deployment.realisation import (
 )
 from ccd_casadi.deployment.source_code import vectors
 from ccd_casadi.extensions.formats.code_formats import structured_text
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import Mechanics
@@ -196,12 +196,12 @@ def made(K: Realisation, **also: object) -> Move:
 
 
 def test_an_unlimited_move_is_the_linear_loop() -> None:
-    K, plant = pid(), sampled(stage(), PERIOD, DELAY)
+    K, plant = pid(), zoh(stage(), PERIOD, DELAY)
     found = made(K)
     errors, _ = simulate(plant, K.system, found.position[:, None, None])
     np.testing.assert_allclose(found.error, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
     for delay in (0.0, 0.123 * PERIOD, 1.77 * PERIOD):  # the delay is that which is given
-        errors, _ = simulate(sampled(stage(), PERIOD, delay), K.system,
+        errors, _ = simulate(zoh(stage(), PERIOD, delay), K.system,
                              found.position[:, None, None])  # fmt: skip
         exact = move(stage(), K, delay, PROFILE).error
         np.testing.assert_allclose(exact, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)

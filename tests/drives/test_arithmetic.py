@@ -19,7 +19,7 @@ from ccd_casadi.extensions.drives.cascade import (
     program_of,
 )
 from ccd_casadi.extensions.drives.drive_data import Number, read_drive
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace as Plant
 
 RATE = 8000.0
@@ -133,7 +133,7 @@ def test_feedforward_of_a_rigid_mass_leaves_what_its_fourth_derivative_makes() -
     """Without, it is the velocity over Kv. At half the speed a jerk's would be an eighth."""
     mass = Plant(*map(np.array, ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0 / 0.11]],
                                  [[1.0, 0.0], [1.0, 0.0]], np.zeros((2, 1)))))  # fmt: skip
-    G, own = sampled(mass, 1.0 / RATE, 375e-6), replace(cascade("generic"), slots=())
+    G, own = zoh(mass, 1.0 / RATE, 375e-6), replace(cascade("generic"), slots=())
     errors = []
     for seconds, ahead in ((0.4, (0.0, 0.0)), (0.4, (1.0, 0.11)), (0.8, (1.0, 0.11))):
         made = program_of(own, np.array(GAINS), ahead, ArithmeticOptions(seconds=seconds))

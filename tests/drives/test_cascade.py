@@ -28,7 +28,7 @@ from ccd_casadi.extensions.drives.drive_design import (
 )
 from ccd_casadi.extensions.drives.proof import SampledModel, prove_cascade
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
@@ -61,7 +61,7 @@ def test_a_prewarped_filter_is_exact_at_its_frequencies() -> None:
 def test_K_is_one_by_responses_states_and_polynomials() -> None:
     own, turn = cascade(), 1.0 / CIRCLE
     K, slopes = own.responses(SLOW, CIRCLE)
-    by_states = own.state_space(SLOW).swept(np.angle(CIRCLE) / RATE.period)[:, 0].T
+    by_states = own.state_space(SLOW).sweep(np.angle(CIRCLE) / RATE.period)[:, 0].T
     np.testing.assert_allclose(by_states, K, rtol=1e-9)
     P, M, Q = (np.prod([np.polyval(c[::-1], turn) for c in part], axis=0)
                for part in own.polynomials(SLOW))  # fmt: skip
@@ -92,8 +92,8 @@ def test_the_model_is_the_sampled_plant() -> None:
     D, *N = model.values(at)
     z = CIRCLE[1:]
     w = (z - 1.0) / model.period
-    G = sampled(plant.plant(at).plant_si(), RATE.period, RATE.delay)
-    expected = G.swept(np.angle(z) / RATE.period)[:, :, 0].T
+    G = zoh(plant.plant(at).plant_si(), RATE.period, RATE.delay)
+    expected = G.sweep(np.angle(z) / RATE.period)[:, :, 0].T
     for j in range(2):
         own = (np.polyval(N[j], w) + np.polyval(N[2 + j], w) / z) / np.polyval(D, w)
         np.testing.assert_allclose(own / z ** model.delay[0], expected[j], rtol=1e-7)
@@ -105,7 +105,7 @@ def figures(values: np.ndarray, shift: float, omega: np.ndarray) -> dict[str, np
     held = control.c2d(control.ss(plant.A, plant.B, plant.C, plant.D), RATE.period, "zoh")
     z = np.exp(1j * omega * RATE.period)
     G = np.array([held(one)[:, 0] for one in z]).T / z**3
-    L = G * cascade().state_space(values).swept(omega)[:, 0].T
+    L = G * cascade().state_space(values).sweep(omega)[:, 0].T
     D = np.abs(1.0 + L.sum(axis=0))
     return {"motor": np.abs(1.0 + L[1]) / D, "load": np.abs(1.0 + L[0]) / D, "actuator": 1.0 / D}
 
@@ -160,8 +160,8 @@ def test_a_slow_integral_and_a_low_filter_hold_the_bandwidth_back() -> None:
     for places, value, allowed in (([2], 1.0, 4.0), ([3, 5], 10.0, 5.0 * HZ)):
         values = SLOW.copy()
         values[places] = value
-        assert search.judged(values)[0] == pytest.approx(allowed)
-    assert cascade().allowed(np.where(np.arange(len(SLOW)) == 0, 2.0, SLOW)).min() == 8.0
+        assert search.judge(values)[0] == pytest.approx(allowed)
+    assert cascade().allowed_bandwidths(np.where(np.arange(len(SLOW)) == 0, 2.0, SLOW)).min() == 8.0
 
 
 @pytest.mark.parametrize("place", [0, 2])
@@ -169,7 +169,7 @@ def test_what_a_constant_force_moves_decays_with_Kv_and_Tn(place: int) -> None:
     """Where one of both is slow the loop has a pole beside it: so `decay` counts them."""
     rate = 1.0  # 1/s
     values = np.where(np.arange(len(SLOW)) == place, rate, SLOW)
-    G, K = sampled(model(), RATE.period, RATE.delay), cascade().state_space(values)
+    G, K = zoh(model(), RATE.period, RATE.delay), cascade().state_space(values)
     A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
     slowest = np.abs(np.log(np.linalg.eigvals(A).astype(complex) + 1e-300)).min() / RATE.period
     assert slowest == pytest.approx(rate, rel=0.05)
@@ -203,8 +203,8 @@ def test_a_design_is_on_the_grid_verified_and_proven() -> None:
     current, setpoint = (np.abs(block.response(own, z)[0]) for own, block in parts)
     assert max(current.max(), (current * setpoint).max()) <= 3.0
     plant = box.plant(np.array([0.01])).plant_si()
-    G = sampled(plant, RATE.period, RATE.delay).swept(omega)[:, :, 0].T
-    L = G * found.controller.swept(omega)[:, 0].T
+    G = zoh(plant, RATE.period, RATE.delay).sweep(omega)[:, :, 0].T
+    L = G * found.controller.sweep(omega)[:, 0].T
     S = np.abs((1.0 + L[0]) / (1.0 + L.sum(axis=0)))
     assert (S[omega < found.bandwidth] <= np.sqrt(0.5) * 1.0011).all()
 
@@ -260,7 +260,7 @@ def pushed(plant: StateSpace) -> StateSpace:
 
 
 def test_what_a_force_moves_is_the_judges_and_that_of_a_simulation() -> None:
-    """Rows of the search, `Loop.moved`, and a loop that is closed sample by sample."""
+    """Rows of the search, `Loop.force_responses`, and a loop that is closed sample by sample."""
     hertz, plant = 20.0, pushed(model())
     own = replace(cascade(), stiff_below=hertz * HZ)
     search = Search(own, bounds(compliance_max=1.0), RATE, [plant], SearchOptions())
@@ -271,9 +271,9 @@ def test_what_a_force_moves_is_the_judges_and_that_of_a_simulation() -> None:
     (most,) = moved_by_forces(own, SLOW, [plant], RATE, HZ)
     assert most == pytest.approx(row.size[:2].max(), rel=0.02)  # largest at 20 Hz, or near it
     K, T, count = own.state_space(SLOW), RATE.period, 4000
-    G = sampled(strictly_proper(plant.A, plant.B[:, :1], plant.C[:2]), T, RATE.delay)
+    G = zoh(strictly_proper(plant.A, plant.B[:, :1], plant.C[:2]), T, RATE.delay)
     parts, n = 8, len(plant.A)  # of a period, in which the force is constant
-    fine = sampled(plant, T / parts, 0.0)
+    fine = zoh(plant, T / parts, 0.0)
     x, k, old, z = np.zeros(n), np.zeros(len(K.A)), [0.0] * 3, []
     assert len(G.A) == n + 3  # the delay is three whole periods
     for i in range(count):

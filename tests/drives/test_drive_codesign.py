@@ -57,7 +57,7 @@ def test_the_best_theta_is_better_and_its_cascade_meets_the_bounds_there() -> No
     plants = plants_at(uncertain, first_points(uncertain))
     search = Search(drive.cascade, drive.bounds, drive.sampling, plants, FEW.drive.search)
     assert search.stable(best.candidate.values)
-    _, excess = search.judged(best.candidate.values)
+    _, excess = search.judge(best.candidate.values)
     assert excess < 10.0 * FEW.drive.search.met
 
 
@@ -91,7 +91,7 @@ def test_a_start_that_breaks_a_constraint_is_no_answer(
     def designed(drive: DriveProblem, theta: tuple[float, ...], *rest: Any) -> DriveAt:
         return DriveAt(theta, theta[0], theta[0], SimpleNamespace(bandwidth=1.0), 1.0)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(drive_case, "_designed", designed)
+    monkeypatch.setattr(drive_case, "_design", designed)
     if there_is:
         assert codesign_drive(drive)[1].theta[0] >= least - 1e-6
         return

@@ -18,7 +18,7 @@ from ccd_casadi.extensions.drives.sheet import sheet_rows
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.lti.between_samples import BetweenSamples
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.reporting.decision import Build, decide
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -66,7 +66,7 @@ def stable(drive: DriveProblem, gain: float = 1.0, late: float = 0.0) -> bool:
     K, rate = drive.cascade.state_space(SLOW), drive.sampling
     delayed = Sampling(rate.rate_hz, rate.delay_us + 1e6 * late)
     for plant in drive.uncertain.as_written(drive.uncertain.corners()):
-        G = sampled(plant, delayed.period, delayed.delay)
+        G = zoh(plant, delayed.period, delayed.delay)
         A = np.block([[G.A - gain * G.B @ K.D @ G.C, gain * G.B @ K.C], [-K.B @ G.C, K.A]])
         if not np.abs(np.linalg.eigvals(A)).max() < 1.0:
             return False
@@ -91,7 +91,7 @@ def test_margins_at_the_sensors_are_those_of_a_loop_in_numpy() -> None:
     K = drive.cascade.responses(SLOW, np.exp(1j * omega / 8000.0))[0]
     phase, distance = np.full(2, np.inf), np.full(2, np.inf)
     for plant in drive.uncertain.as_written(drive.uncertain.corners()):
-        L = sampled(plant, 1.0 / 8000.0, 375e-6).swept(omega)[:, :, 0].T * K
+        L = zoh(plant, 1.0 / 8000.0, 375e-6).sweep(omega)[:, :, 0].T * K
         for i in range(2):
             opened = L[i] / (1.0 + L[1 - i])
             at = np.flatnonzero(np.diff(np.abs(opened) > 1.0))
@@ -161,7 +161,7 @@ def test_behind_a_screw_a_gain_is_in_the_unit_of_the_rotary_motor() -> None:
     assert linear.drive.travel is None
     assert named.drive.travel == pytest.approx(16e-3 / (2.0 * np.pi))
     travel, omega = 16e-3 / (2.0 * np.pi), 7.0
-    Kp = named.settings[1].rounded(4e5)  # N s/m
+    Kp = named.settings[1].round_value(4e5)  # N s/m
     torque = Kp * omega * travel * travel
     typed = round(Kp * named.settings[1].per_si, 6)  # as it is in the drive
     assert typed * omega == pytest.approx(torque)

@@ -12,11 +12,11 @@ from oracles import drive_simulation as oracle
 from ccd_casadi.extensions.drives.cascade_rows import SearchOptions
 from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
 from ccd_casadi.extensions.drives.two_rates import judge_two_rates, lift
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.norms import hinf_norm
 
 PLANT = uncertain().plant(np.array([0.01])).plant_si()
-SYSTEM = sampled(PLANT, RATE.period, RATE.delay)
+SYSTEM = zoh(PLANT, RATE.period, RATE.delay)
 HELD = control.c2d(control.ss(PLANT.A, PLANT.B, PLANT.C, PLANT.D), RATE.period, "zoh")
 
 
@@ -107,7 +107,7 @@ def test_no_course_is_raised_by_more_than_the_norm(slower: int) -> None:
 def test_of_one_rate_it_is_the_loop_that_does_not_change() -> None:
     own, omega = cascade(), np.geomspace(10.0, 3000.0, 30)
     loop = lift(own, SLOW, SYSTEM)
-    L = SYSTEM.swept(omega)[:, :, 0].T * own.state_space(SLOW).swept(omega)[:, 0].T
+    L = SYSTEM.sweep(omega)[:, :, 0].T * own.state_space(SLOW).sweep(omega)[:, 0].T
     for place, above in ((0, 1.0 + L[1]), (1, 1.0 + L[0]), (None, 1.0)):
         np.testing.assert_allclose(loop.fundamental(place, omega), above / (1.0 + L.sum(axis=0)),
                                    rtol=1e-7)  # fmt: skip
@@ -116,7 +116,7 @@ def test_of_one_rate_it_is_the_loop_that_does_not_change() -> None:
 def test_of_one_sensor_both_paths_are_broken() -> None:
     own, omega = replace(cascade(), position=0, velocity=0, sensors=1), np.geomspace(10.0, 3e3, 20)
     system = replace(SYSTEM, C=SYSTEM.C[:1], D=SYSTEM.D[:1])
-    L = system.swept(omega)[:, 0, 0] * own.state_space(SLOW).swept(omega)[:, 0, 0]
+    L = system.sweep(omega)[:, 0, 0] * own.state_space(SLOW).sweep(omega)[:, 0, 0]
     one = lift(own, SLOW, system).fundamental(0, omega)
     np.testing.assert_allclose(one, 1.0 / (1.0 + L), rtol=1e-7)
     slower = lift(replace(own, slower=2), SLOW, system).fundamental(0, omega[:5])
@@ -128,7 +128,7 @@ def test_of_one_sensor_S_low_is_of_the_sine_and_not_of_its_aliases() -> None:
     plant = replace(PLANT, C=PLANT.C[:1], D=PLANT.D[:1])
     limits = bounds(4.0, S_low=0.3, channels=(), error=None)
     found = judge_two_rates(own, SLOW, [plant], limits, RATE)
-    system = sampled(plant, RATE.period, RATE.delay)
+    system = zoh(plant, RATE.period, RATE.delay)
     fast = lift(replace(own, slower=1), SLOW, system).fundamental(0, np.array([limits.omega_low]))
     assert found.worst["S_LOW"] == pytest.approx(abs(fast[0]) / 0.3, rel=0.1)
 

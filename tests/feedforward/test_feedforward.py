@@ -19,7 +19,7 @@ from ccd_casadi.analysis.setpoint import feedforward, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.extensions.feedforward.feedforward_files import (
     OF_DESIGN,
-    improved,
+    improve,
     read_error,
     write_code,
 )
@@ -28,7 +28,7 @@ from ccd_casadi.extensions.feedforward.move_responses import (
     MoveResponses,
     Shape,
     contraction,
-    learned,
+    learn,
     learning_gain,
     least_error,
     responses_of,
@@ -77,7 +77,7 @@ def responses(some: list[Loop] = LOOPS) -> list[MoveResponses]:
 
 def inverse(shape: Shape) -> Array:
     F = feedforward(plant(), SAMPLING.period, SAMPLING.delay)[:, :, 0]
-    return shape.joined(np.ones(1), F[None])
+    return shape.join(np.ones(1), F[None])
 
 
 def test_one_tap_is_the_move_that_simulate_makes() -> None:
@@ -98,13 +98,13 @@ def test_one_tap_is_the_move_that_simulate_makes() -> None:
 def test_taps_delay_and_sum() -> None:
     """Each tap alone is the response of the first, later by its samples."""
     shape, (found,) = Shape(ORDERS, 1, 3, 7), responses(LOOPS[:1])
-    shaped = found.shaped(shape)
+    shaped = found.with_taps(shape)
     rng = np.random.default_rng(0)
     h, F = rng.random(3), rng.random((3, 5, 1))
-    whole = shaped.reached @ shape.joined(h, F)
+    whole = shaped.reached @ shape.join(h, F)
     one, by_hand = Shape(ORDERS, 1), np.zeros_like(whole)
     for i in range(3):
-        part = found.reached @ one.joined(h[i : i + 1], F[i : i + 1])
+        part = found.reached @ one.join(h[i : i + 1], F[i : i + 1])
         by_hand[7 * i :] += part[: len(part) - 7 * i]
     np.testing.assert_allclose(whole, by_hand, rtol=1e-12, atol=1e-15)
 
@@ -113,11 +113,11 @@ def test_taps_delay_and_sum() -> None:
 def test_it_is_the_least_time_within_the_inverses_forces(shape: Shape) -> None:
     plants, x = responses(), inverse(Shape(ORDERS, 1))
     limits = ForceLimits(max(p.peak(x) for p in plants), max(p.heat(x) for p in plants))
-    before = max(p.settled(x, WINDOW) for p in plants)
+    before = max(p.settling_time(x, WINDOW) for p in plants)
     found = least_time(plants, shape, WINDOW, limits, before, inverse(shape))
     assert found is not None
-    shaped = [one.shaped(shape) for one in plants]
-    latest = max(one.settled(found.x, WINDOW) for one in shaped)
+    shaped = [one.with_taps(shape) for one in plants]
+    latest = max(one.settling_time(found.x, WINDOW) for one in shaped)
     assert latest <= found.time + 1e-12 < before
     assert max(one.peak(found.x) for one in shaped) <= limits.peak * 1.002
     assert max(one.heat(found.x) for one in shaped) <= limits.heat * 1.003
@@ -160,7 +160,7 @@ def test_the_inverse_is_a_solution_once_it_is_within_the_window_less_the_margin(
     limits = ForceLimits(max(p.peak(x) for p in plants), max(p.heat(x) for p in plants))
     for window in np.geomspace(1e-6, 1e-3, 7):
         margin = LeastTimeOptions().margin
-        latest = max(p.settled(x, (1.0 - margin) * window) for p in plants)
+        latest = max(p.settling_time(x, (1.0 - margin) * window) for p in plants)
         if np.isfinite(latest):
             found = least_time(plants, shape, float(window), limits, latest, x)
             assert found is not None
@@ -178,11 +178,11 @@ def test_a_time_that_is_too_early_is_refused() -> None:
 def test_three_learned_moves_end_near_their_floor(mass: float, hz: float, shaped: bool) -> None:
     """A plant whose mass and mode are wrong by 5 %: 10 % above the least error at most."""
     shape = Shape(ORDERS, 1, 2, 8) if shaped else Shape(ORDERS, 1)
-    true = responses([loop(mass=10.0 * mass, hz=60.0 * hz)])[0].shaped(shape)
-    model = responses(LOOPS[:1])[0].shaped(shape)
+    true = responses([loop(mass=10.0 * mass, hz=60.0 * hz)])[0].with_taps(shape)
+    model = responses(LOOPS[:1])[0].with_taps(shape)
     gain, x = learning_gain(model, shape), inverse(shape)
     for _ in range(3):
-        x = learned(x, true.tracking(x, shape), gain, shape)
+        x = learn(x, true.tracking(x, shape), gain, shape)
     rms = float(np.sqrt(np.mean(true.tracking(x, shape) ** 2)))
     assert rms <= 1.1 * least_error(true, x, shape)
     assert contraction([true], gain, shape) < 1.0
@@ -220,8 +220,8 @@ def test_the_code_gives_what_is_designed(tmp_path: Path) -> None:
         u.append((K.C @ z + K.D @ e)[0] + force[0])
         z = K.A @ z + K.B @ e
         x = G.A @ x + G.B[:, 0] * u[-1]
-    found = responses([own])[0].shaped(shape)
-    design = shape.joined(h, F)
+    found = responses([own])[0].with_taps(shape)
+    design = shape.join(h, F)
     np.testing.assert_allclose(y, (found.reached @ design)[:300, 0], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(u, (found.force @ design)[:300, 0], rtol=0.0, atol=1e-8)
 
@@ -275,13 +275,13 @@ def test_what_is_learned_is_not_called_judged() -> None:
         **dict.fromkeys(OF_DESIGN, 1.0),
     }  # fmt: skip
     error = 1e-6 * np.sin(np.arange(float(SAMPLES)))[:, None]
-    after, words = improved(run, Path("feedforward.json"), before, error)
+    after, words = improve(run, Path("feedforward.json"), before, error)
     assert after["learned"] == 1
     assert after["forces"] != before["forces"]
     assert all(after[name] is None for name in OF_DESIGN)
     assert any("unknown" in line for line in words)
     with pytest.raises(UserError, match="give the error in m"):
-        improved(run, Path("feedforward.json"), before, 1e6 * error)
+        improve(run, Path("feedforward.json"), before, 1e6 * error)
 
 
 def test_a_loop_that_is_continuous_or_unstable_is_refused() -> None:

@@ -27,7 +27,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.inner_kind import InnerKind
 from ccd_casadi.inner_problem.kinds import KINDS
-from ccd_casadi.inner_problem.objective import violated
+from ccd_casadi.inner_problem.objective import violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost
@@ -84,13 +84,13 @@ class ByRule(InnerKind):
         ends = [[self.at(np.add(theta, s * h))[1].bandwidth for s in (-1, 1)] for h in steps]
         return figures.bandwidth, np.diff(ends).ravel() / (2.0 * np.diag(steps))
 
-    def described(self) -> tuple[str, str]:
+    def describe(self) -> tuple[str, str]:
         return "PID", "by a rule of thumb"
 
     def require_function(self) -> None:
         """It is one function of θ."""
 
-    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+    def gain_bounds(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         raise AssertionError("no page is drawn here")
 
 
@@ -141,7 +141,7 @@ class VerifiedRule(Verified):
     def better(self) -> Finding:
         return Reason.QUOTED(words="a better rule of thumb is known")
 
-    def searched(
+    def search_findings(
         self, outcome: FormulationResult, global_check: GlobalCheck | None
     ) -> tuple[tuple[Finding, ...], Mapping[str, Any]]:
         return search_evidence(1, 1, global_check)
@@ -151,10 +151,10 @@ class VerifiedRule(Verified):
 class RuleOuter(ThetaOuter):
     kkt_level = VerifiedRule.kkt_level
 
-    def verified(self, end: outer_room.PolishedDesign, rounds: int) -> VerifiedRule:
+    def verify(self, end: outer_room.PolishedDesign, rounds: int) -> VerifiedRule:
         theta = tuple(map(float, self.theta_of(end.x)))
         K, figures = ByRule(self.problem).at(theta)
-        feasible = self.problem.inner.feasible(figures) and not violated(self.problem, theta)
+        feasible = self.problem.inner.feasible(figures) and not violations(self.problem, theta)
         return VerifiedRule(
             problem=self.problem, theta=theta, value=end.value, objective=end.objective,
             hardware_cost=hardware_cost(plant_of(self.problem), theta), kkt=end.kkt,

@@ -23,8 +23,8 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.inner_problem.structured_search import least_from, prepared
-from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
+from ccd_casadi.inner_problem.structured_search import least_from, prepare_search
+from ccd_casadi.lti.loop import Loop, Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import (
     build_plant,
@@ -95,7 +95,7 @@ def test_one_mode_has_the_residual_vibration_of_a_bang_bang_move() -> None:
     count = int(np.ceil(profile.duration / T)) + 2
     r = np.append(profile.at(np.arange(count - 1) * T)[0], 0.1)
     f = move.force[:count]
-    found = _Crossing(sampled(plant, T, 0.0), tustin(none, T), r, f, 1e-6, T)
+    found = _Crossing(zoh(plant, T, 0.0), tustin(none, T), r, f, 1e-6, T)
     expected = profile.duration + np.log(amplitude / 1e-6) / (zeta * omega)
     assert found.time == pytest.approx(expected, rel=5e-3)
 
@@ -264,7 +264,7 @@ def test_the_example_is_a_case_of_move_time() -> None:
 
 @pytest.mark.slow
 def test_the_envelope_gradient_is_the_slope_of_the_least_time() -> None:
-    problem, made, _ = prepared(small())
+    problem, made, _ = prepare_search(small())
     problem, made, _ = least_from(problem, problem.start, made)
     assert made.certified
     theta = np.array([0.0155, 0.85])

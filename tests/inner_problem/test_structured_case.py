@@ -182,7 +182,7 @@ def test_channels_of_a_plant_with_several_outputs(tmp_path: Path) -> None:
         ("an effect with controller", ("[controller.channel.1]\nlead = 2",), ""),
     ],
 )  # fmt: skip
-def test_mistakes_about_channels_are_told(
+def test_mistakes_about_channels_are_reported(
     tmp_path: Path, words: str, added: tuple[str, ...], output: str | None
 ) -> None:
     def made() -> Case:
@@ -231,7 +231,7 @@ def test_derivatives_of_a_plant_to_what_is_uncertain(modal: bool) -> None:
         G = box.plant(at).plant_si()
         return complex((G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B))[0, 0])
 
-    q = box.sloped(point)
+    q = box.with_slopes(point)
     np.testing.assert_array_equal(q.A, box.plant(point).A)
     R = np.linalg.inv(s / q.omega_0 * np.eye(len(q.A)) - q.A)
     slopes = zip(q.dA, q.dB, strict=True)
@@ -321,7 +321,7 @@ def test_a_channel_like_another_has_its_bounds(tmp_path: Path) -> None:
         ("b.S_max: is given by like", (*CHANNELS, 'like = "a"\nS_max = 1.5')),
     ],
 )  # fmt: skip
-def test_mistakes_about_own_bounds_are_told(
+def test_mistakes_about_own_bounds_are_reported(
     tmp_path: Path, words: str, added: tuple[str, ...]
 ) -> None:
     with pytest.raises(CaseError, match=words):

@@ -36,7 +36,11 @@ from ccd_casadi.inner_problem.structured_robustness import (
     DesignOnBox,
     certify_corners,
 )
-from ccd_casadi.inner_problem.structured_search import StructuredSearchOptions, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import (
+    StructuredSearchOptions,
+    prepare_search,
+    with_range,
+)
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -46,7 +50,7 @@ from ccd_casadi.support.process_pool import Workers
 
 @pytest.fixture(scope="module")
 def anchored() -> CoDesignProblem:
-    found, made, _ = prepared(quick())
+    found, made, _ = prepare_search(quick())
     assert made.certified
     return found
 
@@ -58,7 +62,7 @@ def test_envelope_gradient_is_the_slope_of_the_true_function(
     case = anchored
     if sampled:
         sections = replace(PID, sampling=Sampling(8000.0, 80.0))
-        case = prepared(quick(sections))[0]
+        case = prepare_search(quick(sections))[0]
     theta, h = np.array([61.0, 58.0]), 1e-3
     value = structured_value(case, theta)
     assert value.feasible
@@ -184,14 +188,14 @@ def test_plants_that_refute_a_design_join_the_set(
     verified = SimpleNamespace(counterexamples=found, problem=alone, design=made)
     with Workers(1) as pool, SampleStore(tmp_path / "a.sqlite") as store:
         outer = StructuredOuter(Sampler(alone, store, pool))
-        more = outer.refuted(verified)  # type: ignore[arg-type]
+        more = outer.add_refuting_plants(verified)  # type: ignore[arg-type]
         assert more is not None
         assert more.repairs == outer.repairs + 1  # so that another lattice judges
         assert state_of(more.problem).scenarios == (*scenarios[:1], *found)
         again = structured_value(more.problem, theta).design
     assert again.certified
     assert again.bandwidth <= made.bandwidth
-    assert outer.refuted(SimpleNamespace(counterexamples=())) is None  # type: ignore[arg-type]
+    assert outer.add_refuting_plants(SimpleNamespace(counterexamples=())) is None  # type: ignore[arg-type]
 
 
 def test_the_range_of_frequencies_is_that_of_the_start() -> None:
@@ -234,14 +238,16 @@ def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
     assert (len(initial), value.syntheses) == (2, 2)
 
 
-def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_multi_start_search_is_of_its_own_bounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With another S_max in the same folder the anchors and words of the first were taken."""
 
     def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace, None]:
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
         return with_state(case, warm_starts=((case.inner.S_max,),)), design, None
 
-    monkeypatch.setattr(stored_searches, "prepared", raced)
+    monkeypatch.setattr(stored_searches, "prepare_search", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
@@ -257,13 +263,13 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     anchored: CoDesignProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
-    honest, searches = structured_bandwidth.ProblemAt.searched, []
+    honest, searches = structured_bandwidth.ProblemAt.search, []
 
     def counted(here: Any, initial: Any, starts: Any = None, **rest: Any) -> Any:
         searches.append(starts)
         return honest(here, initial, starts, **rest)
 
-    monkeypatch.setattr(structured_bandwidth.ProblemAt, "searched", counted)
+    monkeypatch.setattr(structured_bandwidth.ProblemAt, "search", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
         alone = Sampler(with_state(anchored, warm_starts=()), store, pool)
         first = alone.values(np.array(anchored.start))[0]
@@ -277,7 +283,7 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
 def test_few_starts_that_miss_are_not_the_last_word() -> None:
     """No search says that it found nothing from fewer starts than the usual number."""
     impossible = with_structured(quick(), weighted_level=1e-3, starts=1)
-    made = prepared(impossible)[1]
+    made = prepare_search(impossible)[1]
     assert not made.certified
     found = re.match(r"none found from (\d+) starts", made.words)
     assert found is not None

@@ -41,7 +41,7 @@ from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
-from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.loop import tustin, zoh
 from ccd_casadi.reporting.concerns import ConcernOptions
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.robustness import main as robustness_main
@@ -124,7 +124,7 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
     assert len(pairs) == 2
     v = np.geomspace(1e-3, 1e9, 200_000)
     omega = model.omega(v)
-    K = tustin(run.controller, sampling.period).swept(omega)[:, 0, 0]
+    K = tustin(run.controller, sampling.period).sweep(omega)[:, 0, 0]
     at = model.variable(bandwidth)
     for limits in (model, *pairs):
         L = limits.row[0].values(v) * K
@@ -136,9 +136,9 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
         h = basis.values(v)
         seen = np.trapezoid((h * T[:, None]).real, v, axis=0)
         assert np.abs(seen).max() < 1e-3 * np.trapezoid(np.abs(h * T[:, None]), v, axis=0).max()
-    plant = sampled(run.plant.plant_si(), sampling.period, sampling.delay)
+    plant = zoh(run.plant.plant_si(), sampling.period, sampling.delay)
     assert model.row[0].values(v[below]) == pytest.approx(
-        plant.swept(omega[below])[:, 0, 0], rel=1e-4
+        plant.sweep(omega[below])[:, 0, 0], rel=1e-4
     )
 
 
@@ -360,11 +360,11 @@ def test_a_feedforward_for_the_set_settles_on_it_and_learns(folder: Path, tmp_pa
     shape = Shape(tuple(found["orders"]), 1, found["taps"], found["spacing"])
     profile = setpoint(MoveLimits(1e-3, 0.1, 2.0, 1e4, 1e7))
     machine = responses_of(run.loop_on(replace(G, B=1.05 * G.B)), profile, shape.orders, axis=0,
-                           samples=found["samples"]).shaped(shape)  # fmt: skip
+                           samples=found["samples"]).with_taps(shape)  # fmt: skip
 
     def error() -> np.ndarray:
         now = json.loads((tmp_path / "feedforward.json").read_text())
-        x = shape.joined(np.array(now["shaper"]), np.array(now["forces"]))
+        x = shape.join(np.array(now["shaper"]), np.array(now["forces"]))
         return machine.tracking(x, shape)
 
     before = error()

@@ -10,14 +10,14 @@ from oracles.kinds import PID, quick
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import stored_searches, structured_lists
-from ccd_casadi.codesign.catalogue import restricted
+from ccd_casadi.codesign.catalogue import restrict
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem import structured_search
-from ccd_casadi.inner_problem.objective import violated
+from ccd_casadi.inner_problem.objective import violations
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of
 from ccd_casadi.sampling.sampler import Sampler
@@ -65,7 +65,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
         assert result["syntheses"] == sampler.syntheses == thetas > len(races)
         assert len({entry.theta for entry in sampler.trace}) > 4
         for m1 in {result["fixed"]["m1"], *(VALUES[i] for i in beside)} if beside else ():
-            alone = Sampler(restricted(case, {"m1": (m1,)}), store, pool)
+            alone = Sampler(restrict(case, {"m1": (m1,)}), store, pool)
             other = co_design(alone, Lifted(points=4), 0).result["objective"]
             assert result["objective"] <= other + 1e-4 * abs(other)
 
@@ -75,7 +75,7 @@ def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then a few starts are tried there."""
-    honest = structured_lists._climbed
+    honest = structured_lists._descend
 
     def lost(sampler: Sampler, theta: Array) -> Solution:
         near_by = not structured_of(sampler.problem).starts
@@ -84,9 +84,9 @@ def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     case = listed(w2=-0.995)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
         search = ListedStructured(Direct(starts=1), 0, lambda _: pytest.fail("no judge here"))
-        first = search.search(Sampler(restricted(case, {"m1": VALUES[:1]}), store, pool), None)
-        monkeypatch.setattr(structured_lists, "_climbed", lost)
-        other = Sampler(restricted(case, {"m1": VALUES[-1:]}), store, pool)
+        first = search.search(Sampler(restrict(case, {"m1": VALUES[:1]}), store, pool), None)
+        monkeypatch.setattr(structured_lists, "_descend", lost)
+        other = Sampler(restrict(case, {"m1": VALUES[-1:]}), store, pool)
         found = search.search(other, first)
     assert found.result["status"] == "searched"
     assert found.problem is not None
@@ -142,11 +142,11 @@ def test_as_many_places_may_be_chosen_as_the_constraint_allows(
     """With a = 1 the constraint is the number 0: met, though no θ is inside it."""
     (tmp_path / "choice.py").write_text(CHOICE)
     (tmp_path / "case.toml").write_text(CASE)
-    problem = restricted(
+    problem = restrict(
         problem_of(load_case(tmp_path / "case.toml")), {"a": (float(a),), "b": (float(b),)}
     )
-    found = structured_lists._allowed(problem, np.array([1.9]))
+    found = structured_lists._nearest_allowed(problem, np.array([1.9]))
     assert (found is not None) == kept
     if found is not None:
         assert found[0] == pytest.approx(1.5, abs=1e-6)
-        assert not violated(problem, found)
+        assert not violations(problem, found)

@@ -91,7 +91,7 @@ def test_the_optimum_is_the_same_in_any_coordinates(seed: int, log_S: float, log
     """γ_opt and K(s) do not know in which coordinates they were found, but for the errors told."""
     plant = flexible_case(seed).plant if seed % 2 else two_mass(55.0 + 0.05 * seed, 60.0)
     w = PAPER.at(plant.omega_0 * 10.0 ** (log_S - 2.0), plant.omega_0 * 10.0 ** (log_T - 1.5))
-    data = (plant.A, plant.B, plant.C, w.scaled(plant.omega_0), plant.grid, plant.gain)
+    data = (plant.A, plant.B, plant.C, w.scale(plant.omega_0), plant.grid, plant.gain)
     (row, *own), (other, *balanced) = (synthesise(*data, BACKOFF, 0.0, x) for x in (False, True))
     assume(row[Column.CODE] == Code.CERTIFIED)
     assert other[Column.CODE] == Code.CERTIFIED

@@ -139,7 +139,7 @@ def test_hidden_unstable_controller_pole_is_refused(m: float, rate: float) -> No
 def kernels_of(plant: ScaledPlant, controller: StateSpace, weights: Weights):
     K = in_time_unit(controller, plant.omega_0, plant.force)
     Ak, Bk, Ck, Dk = (np.ascontiguousarray(matrix) for matrix in (K.A, K.B, K.C, K.D))
-    w = weights.scaled(plant.omega_0)
+    w = weights.scale(plant.omega_0)
     loop = weighted_loop(plant.A, plant.B, plant.C, Ak, Bk, Ck, Dk, w, 0.0)
     return prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck), Dk, w, loop
 

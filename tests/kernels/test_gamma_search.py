@@ -46,7 +46,7 @@ def test_a_sweep_needs_fewer_schur_forms_than_its_points_alone() -> None:
     plant = two_mass(58.0, 63.0)
     omega_S = np.geomspace(10, 2000, 6) * HZ / plant.omega_0
     omega_T = np.geomspace(20, 1000, 5) * HZ / plant.omega_0
-    w = PAPER.scaled(plant.omega_0)
+    w = PAPER.scale(plant.omega_0)
     numbers = (plant.grid, plant.gain, 1.02, OMEGA_LOW / plant.omega_0)
     rows = design.sweep(plant.A, plant.B, plant.C, w, omega_S, omega_T, *numbers)
     alone = 0.0
@@ -68,7 +68,7 @@ def test_the_search_for_gamma_takes_few_schur_forms() -> None:
     cold, near = [], []
     for S in np.geomspace(10, 2000, 8) * HZ:
         for T in np.geomspace(20, 1000, 5) * HZ:
-            arguments = (plant.A, plant.B, plant.C, PAPER.at(S, T).scaled(plant.omega_0), *numbers)
+            arguments = (plant.A, plant.B, plant.C, PAPER.at(S, T).scale(plant.omega_0), *numbers)
             row = design.design(*arguments, 0.0)[0]
             cold.append(row[design.Column.SCHUR_FORMS])
             for factor in (0.99, 1.01):
@@ -84,7 +84,7 @@ def level():  # type: ignore[no-untyped-def]
     """`riccati_level` of a design as a function of t, t at γ_opt, and what `root_nearby` takes."""
     plant = two_mass(58.0, 63.0)
     _, B1, _, C1, _, d1, _ = gp = generalized_plant(
-        plant.A, plant.B, plant.C, WEIGHTS.scaled(plant.omega_0)
+        plant.A, plant.B, plant.C, WEIGHTS.scale(plant.omega_0)
     )
     H0 = riccati.lqr_hamiltonian(gp)
     gamma = synthesise(plant, WEIGHTS, omega_low=OMEGA_LOW).figures.gamma_opt
@@ -129,7 +129,7 @@ def test_the_step_to_the_root_is_of_order_four(level) -> None:  # type: ignore[n
 def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> None:
     """From either side, where the root is well conditioned."""
     case = flexible_case(seed)
-    plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
+    plant, w = case.plant, case.weights.scale(case.plant.omega_0)
     gp = generalized_plant(plant.A, plant.B, plant.C, w)
     H0 = riccati.lqr_hamiltonian(gp)
     gamma = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
@@ -142,10 +142,10 @@ def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> 
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4, 15, 27])
-def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
+def test_rounding_moves_gamma_as_far_as_is_reported(seed: int) -> None:
     """The spread of the root over random changes of H, against what `rounding_error` foretells."""
     case = flexible_case(seed)
-    plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
+    plant, w = case.plant, case.weights.scale(case.plant.omega_0)
     _, B1, _, C1, _, d1, _ = gp = generalized_plant(plant.A, plant.B, plant.C, w)
     H0 = riccati.lqr_hamiltonian(gp)
     level = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
@@ -173,7 +173,7 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
 def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: int) -> None:
     """Where its own coordinates leave too much, what is handed out is better, and says so."""
     plant = flexible_case(seed).plant
-    w = PAPER.at(0.1 * plant.omega_0, 10.0**-0.5 * plant.omega_0).scaled(plant.omega_0)
+    w = PAPER.at(0.1 * plant.omega_0, 10.0**-0.5 * plant.omega_0).scale(plant.omega_0)
     gp = generalized_plant(plant.A, plant.B, plant.C, w)
     H0 = riccati.lqr_hamiltonian(gp)
     data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, 1.02)

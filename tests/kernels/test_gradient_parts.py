@@ -30,7 +30,7 @@ def small_plant(seed: int, p: int) -> tuple[ScaledPlant, np.ndarray]:
     plant = scaled(mechanics(model, (0.5, 0.5)), 1e5)
     w0 = plant.omega_0
     weights = Weights(2.0, 0.3, 0.8 * w0, 4.0, 0.7 * w0, 1e5, 0.9, 0.3, 1.3 * w0)
-    return plant, weights.scaled(w0)
+    return plant, weights.scale(w0)
 
 
 @few(max_examples=20)

@@ -9,7 +9,7 @@ from oracles.kernel_draws import complex_matrix, random_system, seeds
 
 from ccd_casadi.kernels import frequency
 from ccd_casadi.kernels import linear_algebra as algebra
-from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised
+from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised_rise
 
 
 @few(max_examples=40)
@@ -69,8 +69,8 @@ def test_the_vertex_of_a_parabola_is_found(top: float, bend: float, left: float,
     assert _vertex(a, f(a), x, f(x), b, f(b)) == pytest.approx(top, abs=1e-10)
     assert _vertex(a, -f(a), x, -f(x), b, -f(b)) == x  # it bends upwards
     points = (a, f(a), x, f(x), b, f(b))
-    assert promised(*points) == pytest.approx(3.0 - f(x), rel=1e-6, abs=1e-9)
-    assert promised(a, -f(a), x, -f(x), b, -f(b)) == np.inf
+    assert promised_rise(*points) == pytest.approx(3.0 - f(x), rel=1e-6, abs=1e-9)
+    assert promised_rise(a, -f(a), x, -f(x), b, -f(b)) == np.inf
 
 
 @few(max_examples=60)

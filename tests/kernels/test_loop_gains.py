@@ -30,7 +30,7 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 def loop_of(plant, K: StateSpace, weights=WEIGHTS):  # type: ignore[no-untyped-def]
     parts = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
-    w = weights.scaled(plant.omega_0)
+    w = weights.scale(plant.omega_0)
     return weighted_loop(plant.A, plant.B, plant.C, *parts, w, 0.0)
 
 
@@ -119,7 +119,7 @@ def test_the_gain_of_the_stack_is_that_of_the_si_loop(seed: int, p: int, m: int)
     weights = PAPER.at(30.0 * HZ, 100.0 * HZ)
     weights = type(weights)(**(vars(weights) | {"M_K": 1e5}))
     G, k = frequency.prepare(plant.A, plant.B, plant.C), frequency.prepare(K.A, K.B, K.C)
-    w = weights.scaled(plant.omega_0)
+    w = weights.scale(plant.omega_0)
     omega = np.geomspace(1e-2, 1e2, 9)
     expected = stack_gain(
         plant.plant_si(), in_time_unit(K, 1.0 / plant.omega_0, 1.0 / plant.force), weights,

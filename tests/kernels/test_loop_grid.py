@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccd_casadi.kernels.loop_grid import maxima, merged, unseen
+from ccd_casadi.kernels.loop_grid import find_unseen, maxima, merge
 from ccd_casadi.lti.frequency_grid import RootOptions, root_flanks
 
 APART = 1e-8
@@ -22,7 +22,7 @@ def test_a_grid_goes_through_every_root(seed: int) -> None:
     fixed = np.concatenate(
         [np.tile(base, (3, 1)), root_flanks(plants), np.abs(plants)], axis=1
     )  # fmt: skip
-    v, place = merged(fixed, own, poles, np.array(RootOptions.flanks), (1e-2, 1e2), APART, 1e3)
+    v, place = merge(fixed, own, poles, np.array(RootOptions.flanks), (1e-2, 1e2), APART, 1e3)
     assert (np.diff(v, axis=1) > 0.0).all()
     assert (v[:, 0] < 1e-2).all()
     for i in range(3):
@@ -60,11 +60,11 @@ def test_maxima_are_those_of_a_plain_search(seed: int) -> None:
 def test_a_flat_maximum_between_points_is_sought_and_one_that_shows_is_not(seed: int) -> None:
     x = np.linspace(-1.0, 1.0, 9) + np.random.default_rng(seed).uniform(0.0, 0.2)
     value, v = (-((x**2 - 0.02) ** 2))[None, :, None, None], np.exp(x)[None]
-    _, ends = unseen(value, v, -1e-2)
+    _, ends = find_unseen(value, v, -1e-2)
     shown = maxima(value, v, np.full((1, 1), np.inf), -1e-2)[1]
     for top in np.exp(np.sqrt(0.02) * np.array([-1.0, 1.0])):
         covered = [(low < top) & (top < high) for low, high in (ends.T, shown.T)]
         assert np.concatenate(covered).any()
-    assert unseen(value - 1.0, v, -1e-2)[0].shape == (0, 3)
+    assert find_unseen(value - 1.0, v, -1e-2)[0].shape == (0, 3)
     smooth = (-(x**2))[None, :, None, None]
-    assert unseen(smooth, v, -10.0)[0].shape == (0, 3)
+    assert find_unseen(smooth, v, -10.0)[0].shape == (0, 3)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from ccd_casadi.fixed_structure.certificate_responses import sampled as judged
+from ccd_casadi.fixed_structure.certificate_responses import zoh as judged
 from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, refine_peak, root_flanks
-from ccd_casadi.lti.loop import Loop, Sampling, at_instants, held, in_w, sampled, transfer, tustin
+from ccd_casadi.lti.loop import Loop, Sampling, at_instants, held, in_w, transfer, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, responses_of
 
 OMEGA = np.geomspace(0.1, 50.0, 40)
@@ -26,25 +26,25 @@ def system(seed: int, n: int, m: int, p: int, direct: bool = False) -> StateSpac
 def test_every_response_of_the_closed_loop_is_that_of_its_parts(period: float) -> None:
     G, K = system(1, 5, 2, 2), system(2, 4, 2, 2, direct=True)
     if period:
-        G, K = sampled(G, period, 0.7 * period), tustin(K, period)
+        G, K = zoh(G, period, 0.7 * period), tustin(K, period)
     loop, omega = closed_loop(G, K), OMEGA
     parts = responses_of(G.response(omega), K.response(omega))
     for name in ("S", "KS", "T", "GS"):
         np.testing.assert_allclose(getattr(loop, name).response(omega), parts[name], atol=1e-10)
-    np.testing.assert_allclose(G.swept(omega), G.response(omega), atol=1e-9)
+    np.testing.assert_allclose(G.sweep(omega), G.response(omega), atol=1e-9)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.003, 0.02, 0.033])
 def test_hold_and_delay_are_those_of_the_judge_and_of_the_modal_form(delay: float) -> None:
     G, T = system(3, 4, 2, 2), 0.02
-    found = sampled(G, T, delay).response(OMEGA)
+    found = zoh(G, T, delay).response(OMEGA)
     other = judged(G, Sampling(1.0 / T, 1e6 * delay))
     np.testing.assert_allclose(other.at(np.exp(1j * OMEGA * T)), found, atol=1e-11)
     assert G.modes is not None
     poles, drive, reading = G.modes
     f = transfer(poles, OMEGA, T, delay)
     np.testing.assert_allclose((reading * f[:, None, :]) @ drive, found, atol=1e-10)
-    in_the_plane = in_w(sampled(G, T, delay)).at(2j / T * np.tan(0.5 * OMEGA * T))
+    in_the_plane = in_w(zoh(G, T, delay)).at(2j / T * np.tan(0.5 * OMEGA * T))
     np.testing.assert_allclose(in_the_plane, found, atol=1e-9)
 
 
@@ -105,12 +105,12 @@ def test_a_free_body_beside_resonances_is_held_exactly(delay_us: float) -> None:
         C = np.eye(1, 2) * rng.uniform(1.0, 2.0)
         one = StateSpace(A, np.eye(2, 1, -1), C, np.zeros((1, 1)))
         bodies.append(one)
-        total = total + sampled(one, sampling.period, sampling.delay).response(omega)
+        total = total + zoh(one, sampling.period, sampling.delay).response(omega)
     A = block_diag(*(one.A for one in bodies))
     T = rng.normal(size=(6, 6))  # states of any kind
     B, C = np.vstack([one.B for one in bodies]), np.hstack([one.C for one in bodies])
     mixed = StateSpace(A, B, C, np.zeros((1, 1)))
     np.testing.assert_allclose(held(mixed, omega, sampling), total, rtol=1e-9)
-    np.testing.assert_allclose(mixed.swept(omega), mixed.response(omega), rtol=1e-9)
+    np.testing.assert_allclose(mixed.sweep(omega), mixed.response(omega), rtol=1e-9)
     other = StateSpace(np.linalg.solve(T, A @ T), np.linalg.solve(T, B), C @ T, np.zeros((1, 1)))
     np.testing.assert_allclose(held(other, omega, sampling), total, rtol=1e-5)

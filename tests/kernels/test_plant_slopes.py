@@ -8,7 +8,7 @@ import pytest
 from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import strictly_proper
 from ccd_casadi.plants.scaling import ScaledPlant
 
@@ -37,7 +37,7 @@ def response(
     G = strictly_proper(A, B, C)
     if sampling is None:
         return G.response(np.array([omega]))[0]
-    return sampled(G, sampling.period, sampling.delay).response(np.array([omega]))[0]
+    return zoh(G, sampling.period, sampling.delay).response(np.array([omega]))[0]
 
 
 @pytest.mark.parametrize("free", [False, True])

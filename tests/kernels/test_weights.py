@@ -46,14 +46,14 @@ OMEGA = np.geomspace(1e-4, 1e4, 50)  # over ω₀
 @given(weights, st.floats(10.0, 1e4))
 def test_realisations_are_the_transfer_functions(w: Weights, omega_0: float) -> None:
     expected = w.responses(OMEGA * omega_0)
-    table = first_order_weights(w.scaled(omega_0))
+    table = first_order_weights(w.scale(omega_0))
     for i, (a, b, c, d) in enumerate(table):
         found = d + c * b / (1j * OMEGA + a)
         scale = w.M_K if i == 1 else 1.0  # M_K is absorbed in the unit of force
         # d + cb/(s + a) loses what cancels between d and cb/a
         bound = 1e-14 * (abs(d) + abs(c * b) / np.hypot(OMEGA, a))
         assert (np.abs(found - scale * expected[i]) <= bound).all()
-    found = np.sqrt([squared_weights(w.scaled(omega_0), omega) for omega in OMEGA]).T
+    found = np.sqrt([squared_weights(w.scale(omega_0), omega) for omega in OMEGA]).T
     np.testing.assert_allclose(found / [[1.0], [w.M_K], [1.0]], np.abs(expected), rtol=1e-13)
 
 
@@ -84,7 +84,7 @@ def test_generalized_plant_is_the_mixed_sensitivity_one(
     model = random_plant(seed, rigid=1, flexible=3, inputs=inputs, outputs=outputs)
     plant = scaled(mechanics(model, (0.5, 0.5)), w.M_K)
     A, B1, B2, C1, C2, d1, d2 = generalized_plant(
-        plant.A, plant.B, plant.C, w.scaled(plant.omega_0)
+        plant.A, plant.B, plant.C, w.scale(plant.omega_0)
     )
     p, m = outputs, inputs
     D = np.zeros((2 * p + m + p, p + m))
@@ -121,7 +121,7 @@ def test_generalized_plant_of_the_paper_by_python_control() -> None:
     model = random_plant(3, rigid=1, flexible=2, inputs=1, outputs=1)
     plant = scaled(mechanics(model, (0.5, 0.5)), PAPER.M_K)
     w0 = plant.omega_0
-    A, B1, B2, C1, C2, d1, d2 = generalized_plant(plant.A, plant.B, plant.C, PAPER.scaled(w0))
+    A, B1, B2, C1, C2, d1, d2 = generalized_plant(plant.A, plant.B, plant.C, PAPER.scale(w0))
     unit = Weights(2.0, 1e-4, 800 * HZ / w0, 1e4, 100 * HZ / w0, 1.0, 1.0, 1e-2, 40 * HZ / w0)
     W = [control.ss(system) for system in control_weights(unit)]
     with pytest.warns(FutureWarning, match="connect"):

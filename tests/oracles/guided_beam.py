@@ -27,7 +27,7 @@ from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.inner_problem.structured_search import prepared, with_range
+from ccd_casadi.inner_problem.structured_search import prepare_search, with_range
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 
@@ -67,7 +67,7 @@ def their_pid(w: float, mass: float) -> StateSpace:
 
 def global_check(count: int) -> None:
     """ω_b* on a grid over the box of both heights."""
-    problem = prepared(problem_of(load_case(CASE)))[0]
+    problem = prepare_search(problem_of(load_case(CASE)))[0]
     axes = [np.linspace(low, high, count) for low, high in zip(*box(problem), strict=True)]
     found = []
     for theta in product(*axes):

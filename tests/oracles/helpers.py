@@ -199,7 +199,7 @@ def assessed(
     matrices = (np.ascontiguousarray(matrix) for matrix in (K.A, K.B, K.C, K.D))
     row = np.full(int(Column.COUNT), np.nan)
     row[Column.LIMITED_BY_BOUND] = 0.0
-    scaled_weights = weights.scaled(plant.omega_0)
+    scaled_weights = weights.scale(plant.omega_0)
     low = omega_low / plant.omega_0
     judge(plant.A, plant.B, plant.C, *matrices, scaled_weights, 0.0, gamma, low, row)
     return figures_from_row(row, weights, plant.omega_0)

@@ -15,7 +15,7 @@ import numpy as np
 from ccd_casadi.codesign.verdict import clauses_of
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import read_pages
-from ccd_casadi.support.json_files import restored
+from ccd_casadi.support.json_files import restore
 from ccd_casadi.support.terminal import plain as in_ascii
 
 CLOSE, ON_GRID = 1e-6, 2e-3  # relative: of one number, and of a peak between points of a grid
@@ -28,7 +28,7 @@ LENGTH = rf"({NUMBER})\s?([pnuµm]?)m\b"
 
 def page_of(folder: Path, name: str = "report.html") -> c.Page:
     """As it was kept."""
-    page: c.Page = restored(c.Page, read_pages(folder)[name])
+    page: c.Page = restore(c.Page, read_pages(folder)[name])
     return page
 
 

@@ -223,7 +223,7 @@ def climbed(required: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
         point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
         examined += end.evaluations
     search = DesignSearch(problem, plants, required.sampling, seed=seed)
-    return required, search.designed(point, (), 1, examined)
+    return required, search.make_design(point, (), 1, examined)
 
 
 def proved(required: Case, design: SectionsDesign) -> Proof:

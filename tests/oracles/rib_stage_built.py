@@ -27,7 +27,7 @@ from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.extensions.rib_stage.geometry import NAMES
 from ccd_casadi.extensions.rib_stage.stage_plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.plant import mechanics
 from oracles.sampled_simulation import measure_set
@@ -86,7 +86,7 @@ def judged(
     """Rows of a group, and its worst plant."""
     rows, made = [], plants(theta, seed, group, anywhere, modes)
     for plant, place in made:
-        f = sampled_figures(closed_loop(sampled(plant, 1.0 / RATE, DELAY), K).S)
+        f = sampled_figures(closed_loop(zoh(plant, 1.0 / RATE, DELAY), K).S)
         rows.append({"group": group, "stable": f.stable, "radius": f.spectral_radius,
                      "peak": f.sensitivity_peak if f.stable else None,
                      "bandwidth_hz": f.bandwidth / HZ if f.stable else None, **place})  # fmt: skip
@@ -116,7 +116,7 @@ def main() -> None:
         rows += more
         peak = max(row["peak"] or np.inf for row in more)
         if top < peak < np.inf:
-            held = sampled(plant, 1.0 / RATE, DELAY)
+            held = zoh(plant, 1.0 / RATE, DELAY)
             bandwidth = HZ * min(row["bandwidth_hz"] for row in more)
             top, measured = peak, measure_set([held], K, bandwidth, options.seed)[0]
         print(f"{len(rows)} plants: {summary(rows)}", flush=True)

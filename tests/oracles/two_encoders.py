@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.run_folder import FinishedRun, _measured
+from ccd_casadi.cases.run_folder import FinishedRun, _measure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.lti.state_space import StateSpace
@@ -44,7 +44,7 @@ def by_hand(folder: Path, S_max: float = 2.1, harder: float = 1.0, **other: str)
     case = load_case(folder / "case.toml")
     problem, kappa = problem_of(case), kappa_of(harder)
     K, plant = structure_of(problem).state_space(kappa), scaled_plant(problem, THETA)
-    figures = _measured(problem, plant, K, problem.weights)
+    figures = _measure(problem, plant, K, problem.weights)
     result = {"status": "verified", "theta": dict(zip(problem.names, THETA, strict=True))}
     return FinishedRun(folder, case, problem, THETA, plant, problem.weights, K, figures, result,
                        kappa=kappa)  # fmt: skip

@@ -196,7 +196,9 @@ def test_a_notch_is_dragged_and_a_pin_is_on_the_map_without_scrolling(browser, s
 
 
 @pytest.mark.slow
-def test_a_solve_from_here_tells_how_far_it_is_and_ends_with_its_report(browser, server, tmp_path):
+def test_a_solve_from_here_reports_how_far_it_is_and_ends_with_its_report(
+    browser, server, tmp_path
+):
     page, heard = opened(browser, server[1])
     page.get_by_role("button", name="Solve from here").click()
     page.get_by_text(re.compile(r"sampling +\d+/\d+ \[")).wait_for()
@@ -339,7 +341,7 @@ def test_a_page_from_elsewhere_gets_no_socket(tmp_path):
     assert found == [False, True, True, True]
 
 
-def test_a_package_that_is_missing_is_asked_for_before_anything_is_done(
+def test_a_package_that_is_missing_is_required_before_anything_is_done(
     monkeypatch, capsys, tmp_path
 ):
     def missing(name):

@@ -25,8 +25,14 @@ from ccd_casadi.extensions.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.extensions.explorer.designs import How, Standing, elements_at, judged, present
-from ccd_casadi.extensions.explorer.knobs import Notch, Problems, case_at, knobs_of, notched
+from ccd_casadi.extensions.explorer.designs import (
+    How,
+    Standing,
+    elements_at,
+    judge_figures,
+    present,
+)
+from ccd_casadi.extensions.explorer.knobs import Notch, Problems, case_at, judge_notched, knobs_of
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.extensions.explorer.pins import landscape_of, steepest_axes
 from ccd_casadi.extensions.explorer.session import Session
@@ -35,7 +41,7 @@ from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.places import Places
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.landscape import read_truths
-from ccd_casadi.reporting.machine import lumped, lumped_svg
+from ccd_casadi.reporting.machine import find_lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import loop_panels
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
@@ -145,7 +151,7 @@ def test_a_bound_that_is_missed_is_said_so(session, searched_look):
 
 def test_what_is_not_certified_says_why_and_has_no_bandwidth(searched_look):
     failed = replace(searched_look.figures, outcome=Outcome.UNSTABLE_LOOP)
-    standing, reason = judged(searched_look.problem, failed)
+    standing, reason = judge_figures(searched_look.problem, failed)
     design = replace(searched_look, figures=failed, standing=standing, reason=reason)
     assert standing is Standing.REFUSED
     assert reason == Outcome.UNSTABLE_LOOP.value
@@ -196,7 +202,7 @@ def test_another_plant_than_the_models_own_certifies_nothing(session, searched_l
         assert ("a plant nearby" in words) == (error > 0.0) or kept
 
 
-def test_the_margins_told_are_where_stability_ends(session, searched_look):
+def test_the_margins_reported_are_where_stability_ends(session, searched_look):
     assert "K by itself is stable" in standing_html(searched_look, curves_of(searched_look), None)
     design = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
     c, G, K = curves_of(design), design.plant.plant_si(), design.controller
@@ -325,7 +331,7 @@ def test_a_place_that_is_dragged_moves_what_it_names():
 
 def test_masses_and_springs_are_read_from_the_matrices(session, searched_look):
     system = searched_look.elements.system
-    found = lumped(system)
+    found = find_lumped(system)
     assert found.masses.tolist() == list(searched_look.theta)
     ((i, j, stiffness),) = found.springs  # nothing holds it to the ground
     assert (i, j) == (0, 1)
@@ -334,10 +340,10 @@ def test_masses_and_springs_are_read_from_the_matrices(session, searched_look):
     svg = lumped_svg(found, searched_look.modal, 70.0)
     assert svg.count("<rect") == 2
     assert "mode 1" in svg
-    grounded = lumped(replace(system, K=system.K + np.diag([0.0, 1e6])))
+    grounded = find_lumped(replace(system, K=system.K + np.diag([0.0, 1e6])))
     assert (1, -1, pytest.approx(1e6)) in grounded.springs
     other = family((1.0, 1.0))  # in modal coordinates there are no masses to draw
-    assert lumped(other) is None
+    assert find_lumped(other) is None
     design = replace(searched_look, elements=replace(searched_look.elements, system=other))
     assert "<table>" in machine_html(design, session.start.theta, 1.0)
 
@@ -382,7 +388,7 @@ def test_a_notch_is_judged_as_its_response_has_it(searched_look, depth):
     """L, S and stability against the plain product of responses, by other arithmetic."""
     view = curves_of(searched_look).view
     notch = Notch(1.3 * view.bandwidth_hz, depth, 0.3)
-    found = notched(view, notch)
+    found = judge_notched(view, notch)
     s, w = 2j * np.pi * found.hz, HZ * notch.hz
     own = (s**2 + 2 * 0.3 * depth * w * s + w**2) / (s**2 + 2 * 0.3 * w * s + w**2)
     at = np.isin(found.hz, view.hz)  # lines of the page itself
@@ -398,9 +404,9 @@ def test_a_notch_is_judged_as_its_response_has_it(searched_look, depth):
 
 def test_a_notch_that_is_none_changes_nothing_and_a_hurtful_one_is_called_unstable(searched_look):
     view = curves_of(searched_look).view
-    same = notched(view, Notch(view.bandwidth_hz, 1.0, 0.3)).margins
+    same = judge_notched(view, Notch(view.bandwidth_hz, 1.0, 0.3)).margins
     assert same.phase_deg == pytest.approx(view.margins.phase_deg, rel=1e-3)
-    slow = notched(view, Notch(0.3 * view.bandwidth_hz, 0.01, 2.0))
+    slow = judge_notched(view, Notch(0.3 * view.bandwidth_hz, 0.01, 2.0))
     assert slow.stable == (slow.margins.phase_deg > 0.0)
     wide = replace(view.loop, controller=Notch(0.3, 50.0, 2.0).behind(view.loop.controller))
     assert wide.stable == bool((wide.poles.real < 0.0).all())

@@ -19,7 +19,7 @@ from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.worker_process import WorkerLost
 
 
-def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
+def test_a_solve_reports_its_lines_and_how_it_ended(tmp_path):
     said, codes, over = [], [], threading.Event()
 
     def ended(code):
@@ -34,16 +34,16 @@ def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
     solve.stop()  # there is nothing left to stop
 
 
-def told_and_done(task: int, tell: Callable[[str], None]) -> int:
+def told_and_done(task: int, log: Callable[[str], None]) -> int:
     """Work of a background that tells twice; 0 fails, and a negative number ends its process."""
     for words in ("begun", "nearly done"):
-        tell(words)
+        log(words)
     if task < 0:
         os._exit(3)
     return 6 // task
 
 
-def test_the_background_tells_answers_and_outlives_the_death_of_its_process() -> None:
+def test_the_background_reports_answers_and_outlives_the_death_of_its_process() -> None:
     heard: list[str] = []
     came: Queue[object] = Queue()
     background = Background()

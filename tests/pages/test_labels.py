@@ -60,7 +60,7 @@ def test_words_of_the_explorer_are_inside_and_apart(size: tuple[int, int]) -> No
     near = [Mark(-0.3 + 0.05 * i, -0.4 - 0.08 * i, f"{78.9 + 9 * i:.3g} Hz", ".") for i in range(4)]
     panel = Panel("", "", (Curve(np.cos(angle), np.sin(angle)),), marks=tuple(near))
     figure = painter.PanelFigure("nyquist", "", False, whole_circles=True, inside=size)
-    data = figure._worded(panel, [(0.0, 1.0), (0.0, 1.0)])[1]["data"]
+    data = figure._place_words(panel, [(0.0, 1.0), (0.0, 1.0)])[1]["data"]
     assert len(data["text"]) >= 2
     scale = max(2 * half / v for half, v in zip(painter.HALF, size, strict=True))
     boxes = []

@@ -42,10 +42,10 @@ from ccd_casadi.support.text import HZ
 def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> None:
     problem = problem_of(load_case("runs/two_mass_built.toml"))
     hz = np.geomspace(0.1, 5000.0, 300)
-    S, KS, T = kind_of(problem).bounded(problem.weights, np.nan, 50.0).over(hz)
+    S, KS, T = kind_of(problem).gain_bounds(problem.weights, np.nan, 50.0).over(hz)
     assert isinstance(problem.controller, StructuredProblem)
     ended = replace(problem, controller=replace(problem.controller, shape_ends=ShapeEnd.CROSSING))
-    short = kind_of(ended).bounded(problem.weights, np.nan, 50.0).over(hz)[0]
+    short = kind_of(ended).gain_bounds(problem.weights, np.nan, 50.0).over(hz)[0]
     _, W_KS, W_T = np.abs(problem.weights.responses(HZ * hz))
     assert np.allclose(W_KS * KS, 8.426)
     assert np.allclose(W_T * T, 8.426)

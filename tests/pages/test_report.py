@@ -361,7 +361,7 @@ def test_a_run_without_one_gets_a_report_of_its_design(
     assert (folder / "report.html").read_text(encoding="utf-8") == text
 
 
-def test_a_foreign_or_damaged_report_json_is_told(
+def test_a_foreign_or_damaged_report_json_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = tmp_path / "report.json"

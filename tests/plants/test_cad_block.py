@@ -11,7 +11,7 @@ from oracles.helpers import few
 
 from ccd_casadi.extensions.cad import solid
 from ccd_casadi.extensions.cad.cad_stage import draw_morph
-from ccd_casadi.extensions.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
+from ccd_casadi.extensions.cad.solid import face_at, kernel, load, mesh_solid, moved_points, volumes
 from ccd_casadi.support.errors import PlantError
 
 lengths = st.floats(20.0, 200.0)
@@ -39,7 +39,7 @@ def test_a_linear_change_of_the_solid_is_that_of_its_mesh(
     shear *= min(first) / 200.0
     with kernel() as gmsh:
         load(gmsh, draw(folder / "first.json", first))
-        mesh = meshed(gmsh, 1.0)
+        mesh = mesh_solid(gmsh, 1.0)
         before = gmsh.axes
         load(gmsh, draw(folder / "second.json", second, shear, turn))
         points = moved_points(gmsh, mesh)
@@ -51,7 +51,7 @@ def test_a_linear_change_of_the_solid_is_that_of_its_mesh(
 def test_faces_are_found_by_their_points(tmp_path: Path) -> None:
     with kernel() as gmsh:
         load(gmsh, draw(tmp_path / "one.json", (100.0, 60.0, 10.0), turn=2))
-        mesh = meshed(gmsh, 1.0)
+        mesh = mesh_solid(gmsh, 1.0)
         top = face_at(gmsh, "top", (50.0, 30.0, 10.0))
         np.testing.assert_allclose(mesh.points[np.unique(mesh.faces[top]), 2], 0.01)
         assert len(mesh.faces[top]) == 2 * CELLS**2

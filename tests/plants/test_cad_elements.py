@@ -11,8 +11,8 @@ from ccd_casadi.extensions.cad.cad_stage import (
     read_morph,
     write_morph,
 )
-from ccd_casadi.extensions.cad.elastic_body import Body, Material, reduced
-from ccd_casadi.extensions.cad.solid import extended, volumes
+from ccd_casadi.extensions.cad.elastic_body import Body, Material, reduce_body
+from ccd_casadi.extensions.cad.solid import extend, volumes
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
 
@@ -109,7 +109,7 @@ def test_a_held_bar_bends_at_the_frequency_of_a_beam() -> None:
     held[:, body.on(face(points, tets, 0.0))] = True
     none = np.zeros((0, *points.shape))
     F = np.zeros((3 * count, 1))
-    found = reduced(body, none, F, np.zeros((0, *F.shape)), 2, held.ravel())
+    found = reduce_body(body, none, F, np.zeros((0, *F.shape)), 2, held.ravel())
     beam = 1.8751**2 * np.sqrt(70e9 * SIDE**2 / 12.0 / 2700.0) / LENGTH**2
     assert found.M.shape == (2, 2)
     assert np.sqrt(np.diag(found.K)) == pytest.approx([beam, beam], rel=1e-2)
@@ -185,12 +185,12 @@ def test_a_linear_function_is_its_own_extension() -> None:
     inside = np.all((points > 1e-9) & (points < [LENGTH - 1e-9, SIDE - 1e-9, SIDE - 1e-9]), axis=1)
     rim = np.flatnonzero(~inside)
     A = np.random.default_rng(0).standard_normal((3, 3))
-    np.testing.assert_allclose(extended(points, tets, rim, points[rim] @ A), points @ A, atol=1e-13)
+    np.testing.assert_allclose(extend(points, tets, rim, points[rim] @ A), points @ A, atol=1e-13)
     side = face(points, tets, 0.0)  # triangles in space
     corners = np.unique(side)
     edge = corners[(points[corners, 1:] < 1e-9).any(1) | (points[corners, 1:] > SIDE - 1e-9).any(1)]
     assert edge.size < corners.size
-    on_side = extended(points, side, edge, points[edge] @ A)[corners]
+    on_side = extend(points, side, edge, points[edge] @ A)[corners]
     np.testing.assert_allclose(on_side, points[corners] @ A, atol=1e-13)
 
 
@@ -207,7 +207,7 @@ def test_a_morph_is_read_as_written(tmp_path) -> None:
         read_morph(tmp_path / "x.npz")
 
 
-def test_an_element_inside_out_is_told() -> None:
+def test_an_element_inside_out_is_reported() -> None:
     with pytest.raises(PlantError, match=r"inside out at length=-0\.3"):
         stretched().morph.points((-0.3, 0.02))
 

@@ -12,8 +12,8 @@ from ccd_casadi.extensions.cad.solid import (
     face_at,
     kernel,
     load,
-    matched,
-    meshed,
+    match,
+    mesh_solid,
     moved_points,
     volumes,
 )
@@ -48,7 +48,7 @@ def test_nodes_stay_on_their_faces(tmp_path: Path) -> None:
     second = plate(tmp_path / "second.step", 130.0, 16.0)
     with kernel() as gmsh:
         load(gmsh, first)
-        mesh = meshed(gmsh, 15e-3)
+        mesh = mesh_solid(gmsh, 15e-3)
         end = face_at(gmsh, "end", (-50.0, 0.0, 5.0))
         load(gmsh, second)
         points = moved_points(gmsh, mesh)
@@ -74,7 +74,7 @@ def test_another_topology_is_refused(tmp_path: Path) -> None:
     ]
     with kernel() as gmsh:
         load(gmsh, files[0])
-        mesh = meshed(gmsh, 20e-3)
+        mesh = mesh_solid(gmsh, 20e-3)
         load(gmsh, files[1])
         with pytest.raises(PlantError, match="corners where the meshed one has"):
             moved_points(gmsh, mesh)
@@ -111,14 +111,14 @@ def bar(length: float, names: dict[int, int]) -> Boundary:
 
 
 def test_pieces_numbered_anew_are_found_again() -> None:
-    found = matched(bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}), bar(1.2, {1: 8, 2: 7, 3: 6, 4: 5}))
+    found = match(bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}), bar(1.2, {1: 8, 2: 7, 3: 6, 4: 5}))
     assert found == ({1: 8, 2: 7}, {3: 6}, {4: 5})
 
 
 def test_an_edge_that_runs_the_other_way_is_turned() -> None:
     one, other = (bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}) for _ in range(2))
     turned = Piece("Line", other.edges[3].rim, other.edges[3].points[::-1])
-    _, edges, _ = matched(one, Boundary(other.corners, {3: turned}, other.faces))
+    _, edges, _ = match(one, Boundary(other.corners, {3: turned}, other.faces))
     assert edges == {3: -3}
 
 
@@ -126,4 +126,4 @@ def test_a_face_of_another_kind_is_refused() -> None:
     one, other = (bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}) for _ in range(2))
     bending = Piece("Cylinder", other.faces[4].rim, other.faces[4].points)
     with pytest.raises(PlantError, match=r"the face \(Plane\) at .* has no counterpart"):
-        matched(one, Boundary(other.corners, other.edges, {4: bending}))
+        match(one, Boundary(other.corners, other.edges, {4: bending}))

@@ -33,7 +33,7 @@ from ccd_casadi.plants.modal import (
     modal_plant,
     require_damping,
 )
-from ccd_casadi.plants.places import Places, placed
+from ccd_casadi.plants.places import Places, place_ports
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
 from ccd_casadi.plants.plant_facts import PlantFacts, PlantMode, facts_of
 from ccd_casadi.plants.registry import two_mass
@@ -144,12 +144,12 @@ def test_a_set_has_derivatives_to_its_point(seed: int, ranged: bool) -> None:
     point = uncertain.nominal + 0.3 * rng.uniform(size=len(uncertain.names)) * (
         uncertain.box[1] - uncertain.nominal
     )
-    here = uncertain.sloped(point)
+    here = uncertain.with_slopes(point)
     own, s = here.plant_si(), 1j * OMEGA[:, None, None]
     R = np.linalg.inv(s * np.eye(len(own.A)) - own.A)
     for k, (dA, dB, dC) in enumerate(here.changes_si()):
         step = h * np.eye(len(point))[k]
-        ends = [response(uncertain.sloped(point + e).plant_si(), OMEGA) for e in (-step, step)]
+        ends = [response(uncertain.with_slopes(point + e).plant_si(), OMEGA) for e in (-step, step)]
         slope = (ends[1] - ends[0]) / (2.0 * h)
         found = dC @ R @ own.B + own.C @ R @ (dA @ R @ own.B + dB)
         size = 1e-4 * np.abs(slope) + 1e-6 * np.abs(response(own, OMEGA))
@@ -311,7 +311,7 @@ def test_what_is_no_plant_of_first_order_is_refused(parts: dict[str, Any], words
 def test_places_are_refused_where_no_mass_is_given() -> None:
     """Neither a mass that moves along nor a sensor's row is known of A, B and C."""
     plant = replace(drawn(0), inputs=3)
-    moved = placed(plant, Places(((0.0,), (1.0,), (2.0,)), ((0.5,),)), ["p"])
+    moved = place_ports(plant, Places(((0.0,), (1.0,), (2.0,)), ((0.5,),)), ["p"])
     with pytest.raises(PlantError, match=r"\[places\] needs a plant function that returns mass"):
         mechanics(moved, THETA)
 
@@ -324,7 +324,7 @@ def test_places_are_refused_where_no_mass_is_given() -> None:
         (np.diag([-1.0, 0.0, 0.0]), "pole at 0 of A is not driven"),
     ],
 )
-def test_poles_that_cannot_be_told_apart_are_refused(A: np.ndarray, words: str) -> None:
+def test_poles_that_cannot_be_reported_apart_are_refused(A: np.ndarray, words: str) -> None:
     n = len(A)
     C = np.eye(1, n) if n == 3 and A[0, 1] else np.ones((1, n))
     B = np.ones((n, 1))

@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.sampler import Sampler
@@ -66,7 +66,7 @@ def anchored() -> CoDesignProblem:
     assert isinstance(problem.controller, StructuredProblem)
     # where |S| may leap at ω_b the optimum lies on a kink
     few = replace(problem.controller, starts=4, shape_ends=ShapeEnd.CROSSING)
-    found, made, _ = prepared(replace(problem, controller=few))
+    found, made, _ = prepare_search(replace(problem, controller=few))
     assert made.certified
     return found
 

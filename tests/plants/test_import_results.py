@@ -127,7 +127,7 @@ def test_the_summary_says_what_was_written(
         ("beam_10.frd", " -1         1-", " -1         1?", "beam_10.frd: is damaged"),
     ],
 )
-def test_wrong_results_are_told(
+def test_wrong_results_are_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, old: str, new: str, words: str
 ) -> None:
     path = folder_of(tmp_path, ".frd") / file

@@ -100,7 +100,7 @@ def test_modes_by_frequency_alone_would_not_do() -> None:
     """The frame chosen is better by far than the naive one: the choice is worth its trouble."""
     table, modes = veering(0.02), veering_modes(0.02)
     assert modes.frame.name == "modes matched, close ones turned together"
-    naive = modes._fitted(frames(table, 0)[0])
+    naive = modes._fit(frames(table, 0)[0])
     assert naive[0].name == "modes in order of frequency"
     assert naive[2].response > 10.0 * modes.left_out.response
 
@@ -210,7 +210,7 @@ HEAD = "t,mode,frequency_hz,damping,in:u,out:y\n"
         (HEAD.replace("out:y", "in:u") + "0,1,1,.1,1,1\n", "empty or twice"),
     ],
 )
-def test_a_wrong_table_is_told(tmp_path: Path, text: str, words: str) -> None:
+def test_a_wrong_table_is_reported(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "m.csv").write_text(text)
     with pytest.raises(PlantError, match=r"m\.csv: ") as caught:
         plant_of_table(read_modal_table(tmp_path / "m.csv"), ("t",), 0.1, "m.csv")
@@ -238,7 +238,9 @@ def case(folder: Path, *changes: tuple[str, str]) -> Path:
         ("rigid_modes = 2", "rigid_modes = 3", "2 rigid-body modes at the start"),
     ],
 )
-def test_a_wrong_case_of_a_table_is_told(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_wrong_case_of_a_table_is_reported(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
     with pytest.raises(CaseError) as caught:
         problem_of(load_case(case(tmp_path, (old, new))))
     assert words in str(caught.value)
@@ -342,7 +344,7 @@ def test_static_correction_restores_the_compliance_that_truncation_loses() -> No
         ("M02.mat", "nonsense", "M02.mat: cannot be read"),
     ],
 )  # fmt: skip
-def test_wrong_files_are_told(tmp_path: Path, file: str, text: str | None, words: str) -> None:
+def test_wrong_files_are_reported(tmp_path: Path, file: str, text: str | None, words: str) -> None:
     folder = matrix_folder(tmp_path)
     if text is None:
         (folder / file).unlink()

@@ -69,7 +69,7 @@ def test_differences_are_the_exact_derivatives_up_to_the_bounds(a: float, b: flo
     assert constraint_values(plant, theta) == pytest.approx(constraint_values(exact, theta), **last)
 
 
-def test_the_function_is_never_asked_outside_the_bounds() -> None:
+def test_the_function_is_never_required_outside_the_bounds() -> None:
     required = []
 
     def watched(theta):
@@ -85,7 +85,7 @@ def test_the_function_is_never_asked_outside_the_bounds() -> None:
     assert (np.array(required) <= np.array(UPPER) * (1 + 1e-12)).all()
 
 
-def test_the_error_told_is_above_the_true_one_and_shows_noise() -> None:
+def test_the_error_reported_is_above_the_true_one_and_shows_noise() -> None:
     theta = (1.7, 3e-3)
     plant = user_plant(numbers_only, NAMES, {}, LOWER, UPPER)
     reported = float(plant.notes(theta)[0].split("at most ")[1].split()[0])

@@ -18,7 +18,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.nodes import NodeInterpolation
-from ccd_casadi.plants.places import Places, placed
+from ccd_casadi.plants.places import Places, place_ports
 from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
 
@@ -77,7 +77,7 @@ def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed
 def test_slopes_are_those_of_differences(at: tuple[float, float], seed: int) -> None:
     """To 1e-6, of M, K, B and C to stiffness and positions."""
     places = Places(GRID, POINTS, POINTS[:2], 0.4, 0.1)
-    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    plant = place_ports(beam_of_nodes(seed), places, ("x", "k", "y"))
     theta = np.array([at[0], 1.3, at[1]])
     compare_slopes(plant, theta)
 
@@ -106,8 +106,8 @@ SIX = (("x", "y"), ("-x", 0.13), (0.05, "-y"), (-0.2, -0.1), (0.22, 0.1), (-0.1,
 def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], seed: int) -> None:
     """Forces of length 1 along 1, x, y and a damped mode, none on the quiet one."""
     places = Places(GRID, SIX, SIX, 0.4, 0.1, axes=True, quiet=(1,), damped=(3,))
-    free = placed(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "y"))
-    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    free = place_ports(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "y"))
+    plant = place_ports(beam_of_nodes(seed), places, ("x", "k", "y"))
     theta = np.array([at[0], 1.3, at[1]])
     system, apart = mechanics(plant, theta), mechanics(free, theta)
     assert (plant.inputs, plant.outputs, system.B.shape) == (4, 4, (7, 4))
@@ -132,8 +132,8 @@ def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
     """By the least forces that do it; of three points without twist."""
     corners = CORNERS[:count]
     places = Places(GRID, SIX, SIX[1:], 0.4, 0.1, reference=corners)
-    free = placed(beam_of_nodes(seed), replace(places, reference=()), ("x", "k", "y"))
-    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    free = place_ports(beam_of_nodes(seed), replace(places, reference=()), ("x", "k", "y"))
+    plant = place_ports(beam_of_nodes(seed), places, ("x", "k", "y"))
     theta = np.array([at[0], 1.3, at[1]])
     system, apart = mechanics(plant, theta), mechanics(free, theta)
     assert (plant.inputs, plant.outputs, system.B.shape) == (count, count, (7, count))
@@ -159,8 +159,8 @@ def test_an_actuator_that_is_not_there_is_as_if_never_given(
     flags = tuple(f"p{i}" for i in range(6))
     whole = Places(GRID, SIX, SIX, 0.4, 0.1, present=flags, choose=4, **how)
     some = replace(whole, actuators=tuple(SIX[i] for i in (0, 2, 3, 5)), present=(), choose=0)
-    plant = placed(beam_of_nodes(seed), whole, ("x", "k", "y", *flags))
-    four = placed(beam_of_nodes(seed), some, ("x", "k", "y"))
+    plant = place_ports(beam_of_nodes(seed), whole, ("x", "k", "y", *flags))
+    four = place_ports(beam_of_nodes(seed), some, ("x", "k", "y"))
     theta = np.array([at[0], 1.3, at[1]])
     x, y = np.array([at, (0.05, -at[1]), SIX[3], SIX[5]]).T
     assume(np.linalg.cond(np.stack([1.0 + 0.0 * x, x / 0.3, y / 0.2, x * y / 0.06])) < 100.0)
@@ -173,7 +173,7 @@ def test_an_actuator_that_is_not_there_is_as_if_never_given(
     compare_slopes(plant, parts)
     assert plant.constraint_names[-1] == "actuators chosen"
     assert constraint_values(plant, parts)[-1] == pytest.approx(3.9 / 4.0 - 1.0)
-    dearer = placed(beam_of_nodes(seed), replace(whole, actuator_cost=0.5), plant.names)
+    dearer = place_ports(beam_of_nodes(seed), replace(whole, actuator_cost=0.5), plant.names)
     assert hardware_cost(dearer, parts) == pytest.approx(hardware_cost(plant, parts) + 0.5 * 3.9)
 
 
@@ -182,7 +182,7 @@ def test_an_actuator_that_is_not_there_is_as_if_never_given(
 def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
     at: tuple[float, float], kg: float
 ) -> None:
-    plant = placed(beam_of_nodes(0), Places(GRID, POINTS, (), kg), ("k", "x", "y"))
+    plant = place_ports(beam_of_nodes(0), Places(GRID, POINTS, (), kg), ("k", "x", "y"))
     M = mechanics(plant, (1.0, *at)).M[:3, :3]
     r = np.array([[1.0, *p] for p in (at, (-at[0], 0.1), (0.05, -at[1]))])
     assert pytest.approx(np.diag([KG, *INERTIA]) + kg * r.T @ r, abs=1e-9) == M
@@ -191,7 +191,7 @@ def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
 
 def test_distances_are_kept_where_theta_moves_them() -> None:
     corners = (("r", "r"), ("-r", "-r"), (0.0, 0.1), (0.1, 0.0))
-    plant = placed(beam_of_nodes(0), Places(GRID, corners, corners, apart=0.2), ("k", "r"))
+    plant = place_ports(beam_of_nodes(0), Places(GRID, corners, corners, apart=0.2), ("k", "r"))
     assert len(plant.constraint_names) == 5  # of six pairs one stands still; sensors are the same
     assert constraint_values(plant, (1.0, 0.1))[0] == pytest.approx(1.0 - 0.08 / 0.04)
 
@@ -209,7 +209,7 @@ def test_what_does_not_match_is_one_sentence() -> None:
         (Places(GRID, POINTS, POINTS, axes=True, present=("k",), choose=3), "for each actuator"),
     ):
         with pytest.raises(PlantError, match=words):
-            placed(plant, places, ("k", "x", "y"))
+            place_ports(plant, places, ("k", "x", "y"))
 
 
 def test_the_case_moves_with_its_places(tmp_path: Path) -> None:
@@ -265,7 +265,7 @@ def test_a_parameter_that_varies_is_one_of_the_box() -> None:
     near = [uncertain.plant(point + k * step * np.eye(2)[1]).plant_si() for k in (-2, -1, 1, 2)]
     omega = 2.0 * np.pi * np.array([3.0, 40.0, 150.0, 330.0])
     found = np.tensordot([1, -8, 8, -1], [one.response(omega) for one in near], 1) / (12 * step)
-    sloped = uncertain.sloped(point)
+    sloped = uncertain.with_slopes(point)
     dA, dB, dC = (part[1] for part in (sloped.dA, sloped.dB, sloped.dC))
     for i, w in enumerate(omega / sloped.omega_0):
         R = np.linalg.inv(1j * w * np.eye(len(sloped.A)) - sloped.A)

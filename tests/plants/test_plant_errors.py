@@ -48,7 +48,7 @@ def case_of(folder: Path, line: str, more: str = "") -> Path:
         ("return [a, b]", "returned a list"),
     ],
 )
-def test_each_fault_is_told_as_what_it_is(tmp_path: Path, line: str, words: str) -> None:
+def test_each_fault_is_reported_as_what_it_is(tmp_path: Path, line: str, words: str) -> None:
     with pytest.raises(CaseError, match=words) as error:
         problem_of(load_case(case_of(tmp_path, line)))
     assert "\n" not in str(error.value)

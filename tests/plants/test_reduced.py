@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.extensions.rib_stage import reduced
 from ccd_casadi.extensions.rib_stage.geometry import COARSE, Geometry, PointMass
-from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, faded
+from ccd_casadi.extensions.rib_stage.model import TWENTY, RibStage, fade
 from ccd_casadi.extensions.rib_stage.stage_plant import plant_of_stage
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.plants.registry import two_mass_plant
@@ -109,16 +109,16 @@ def test_what_fades_is_whole_at_one_end_and_gone_at_the_other(
 ) -> None:
     values, rates = np.cumsum(steps), np.array(steps[::-1])[None]
     full = len(values) - 1 - fading
-    w, dw = faded(values, rates, full)
+    w, dw = fade(values, rates, full)
     assert (w[:full] == 1.0).all()
     assert (dw[:, :full] == 0.0).all()
     assert (np.diff(w) <= 0.0).all()
     assert (w > 0.0).all()
-    up, down = (faded(values + s * 1e-6 * rates[0], rates, full)[0] for s in (1.0, -1.0))
+    up, down = (fade(values + s * 1e-6 * rates[0], rates, full)[0] for s in (1.0, -1.0))
     np.testing.assert_allclose(dw[0], (up - down) / 2e-6, atol=1e-8)
     # The next one takes the place of the last one that counts whole, and one that is gone comes.
     meet = np.insert(values, full, values[full - 1])[: len(values)]
-    assert faded(meet, np.zeros((1, len(meet))), full)[0][full] == 1.0
+    assert fade(meet, np.zeros((1, len(meet))), full)[0][full] == 1.0
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.support.errors import UserError
@@ -34,7 +34,7 @@ def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
                          mode_shift=0.02, damping=(0.5, 2.0))  # fmt: skip
     K = built.controller(built.DESIGN)
     for _, point in box.corners()[1:]:
-        loop = closed_loop(sampled(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K).S
+        loop = closed_loop(zoh(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K).S
         figures = sampled_figures(loop)
         assert figures.stable
         assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-4)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.lti.loop import sampled
-from ccd_casadi.lti.state_space import StateSpace, balanced, closed_loop
+from ccd_casadi.lti.loop import zoh
+from ccd_casadi.lti.state_space import StateSpace, balance_system, closed_loop
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Mechanics
@@ -91,7 +91,7 @@ def test_the_plant_as_written_answers_as_its_modes_do(off) -> None:
     s = 2j * np.pi * np.geomspace(0.05, 500.0, 400)
     a, b = modal.at(s), written.at(s)
     assert np.abs(a - b).max(axis=(1, 2)) / np.abs(a).max(axis=(1, 2)) == pytest.approx(0, abs=1e-9)
-    held = [sampled(own, 1e-3, 4e-4) for own in (modal, written)]
+    held = [zoh(own, 1e-3, 4e-4) for own in (modal, written)]
     z = np.exp(1e-3 * s)
     a, b = (own.at(z) for own in held)
     assert np.abs(a / b - 1.0).max() < 1e-6
@@ -133,7 +133,7 @@ def test_the_loop_of_the_plant_as_written_keeps_its_slow_poles_beside_a_stiff_li
     ]
     controller = StateSpace(-np.diag(rates), np.ones((3, 1)), np.array([read]), np.zeros((1, 1)))
     loop = closed_loop(as_written(system), controller)
-    found = np.linalg.eigvals(balanced(loop.A, loop.B_r, loop.C_y)[0])
+    found = np.linalg.eigvals(balance_system(loop.A, loop.B_r, loop.C_y)[0])
     with mp.workdps(60):
         root = [mp.sqrt(m) for m in masses.tolist()]
         scaled = mp.matrix(3, 3)

@@ -69,7 +69,9 @@ def test_json_of_either_kind_and_the_runs_own(two_mass_run: Path, tmp_path: Path
         ("k.txt", "", ".json, .toml or .mat"),
     ],
 )
-def test_what_is_no_controller_is_told(tmp_path: Path, name: str, text: str, words: str) -> None:
+def test_what_is_no_controller_is_reported(
+    tmp_path: Path, name: str, text: str, words: str
+) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match=words):
         read_controller(tmp_path / name)

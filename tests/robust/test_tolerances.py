@@ -29,10 +29,10 @@ from ccd_casadi.extensions.tolerances.machines import (
     count_failures,
     draw_machines,
 )
-from ccd_casadi.extensions.tolerances.prices import Bought, WidthSearch, promised, scaled
+from ccd_casadi.extensions.tolerances.prices import Bought, WidthSearch, promised_gain, scale_width
 from ccd_casadi.extensions.tolerances.share_search import NoDesign, ShareOptions, ShareSearch
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.report import main as report_main
 from ccd_casadi.robustness import main as robustness_main
@@ -111,7 +111,7 @@ def test_failures_are_counted_anew_for_each_design(monkeypatch: pytest.MonkeyPat
         return one
 
     monkeypatch.setattr(ShareSearch, "with_draws", drawn_on)
-    monkeypatch.setattr(ShareSearch, "redesigned", redesigned)
+    monkeypatch.setattr(ShareSearch, "redesign", redesigned)
     found = search.at_its_theta(lambda _: None, ShareOptions(), Trial(3, 2), 8)
     assert (designs, found.rounds, found.settled) == ([1, 4], 7, True)
     assert not replace(found).at_its_theta(lambda _: None, ShareOptions(), Trial(2, -1), 1).settled
@@ -264,10 +264,10 @@ def test_scaled_widths_keep_the_model(tmp_path: Path) -> None:
     problem = problem_of(load_case(case_file(tmp_path, ROBUST)))
     whole = uncertain_plant(problem, problem.start)
     for name in whole.names:
-        gone = uncertain_plant(scaled(problem, name, 0.0), problem.start)
+        gone = uncertain_plant(scale_width(problem, name, 0.0), problem.start)
         assert set(gone.names) == set(whole.names) - {name}
-        assert scaled(problem, name, 1.0) == problem
-        half = uncertain_plant(scaled(problem, name, 0.5), problem.start)
+        assert scale_width(problem, name, 1.0) == problem
+        half = uncertain_plant(scale_width(problem, name, 0.5), problem.start)
         column = list(whole.names).index(name)
         assert half.nominal[column] == whole.nominal[column]
         assert (np.clip(half.box, *whole.box) == half.box).all()
@@ -279,7 +279,7 @@ def test_prices_fall_with_the_width_and_bought_widths_are_a_case(
     """The whole tolerance costs at least what half of it buys, and the slope has the same sign."""
     robust = "[robust]\ngain = 0.04\ncost_per_percent = {gain = 0.1}\n"
     case = load_case(case_file(tmp_path, robust))
-    found, design, _ = prepared(problem_of(case))
+    found, design, _ = prepare_search(problem_of(case))
     end = Bought({"gain": 0.05}, (58.5, 59.5), design.kappa, 1.0, 1.0, {})
     made = WidthSearch(end, end, 1, np.nan)
     monkeypatch.setattr(answers, "buy", lambda *_: made)
@@ -336,8 +336,8 @@ def test_the_gap_of_a_convex_objective_is_an_upper_bound() -> None:
         slopes = dict(zip(names, (2.0 * (u - a)).tolist(), strict=True))
         at = Bought(dict(zip(names, np.exp(u), strict=True)), (), u, 1.0, 0.0, slopes)
         fall = ((u - a) ** 2 - (np.clip(a, *bounds.T) - a) ** 2).sum()
-        assert promised(at, dict.fromkeys(names, 1.0), bounds) >= fall - 1e-12
-        assert np.isnan(promised(replace(at, slopes={}), dict.fromkeys(names, 1.0), bounds))
+        assert promised_gain(at, dict.fromkeys(names, 1.0), bounds) >= fall - 1e-12
+        assert np.isnan(promised_gain(replace(at, slopes={}), dict.fromkeys(names, 1.0), bounds))
 
 
 # ---- the command ---------------------------------------------------------------------------------

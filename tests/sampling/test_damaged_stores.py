@@ -123,7 +123,7 @@ def test_a_damaged_store_is_refused_or_reads_plain_samples(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["proc", "folder", "absent"])
-def test_a_place_that_holds_no_file_is_told(tmp_path: Path, name: str) -> None:
+def test_a_place_that_holds_no_file_is_reported(tmp_path: Path, name: str) -> None:
     """Root may write nearly everywhere, but not make a file in /proc."""
     (tmp_path / "folder").mkdir()
     places = {
@@ -136,7 +136,7 @@ def test_a_place_that_holds_no_file_is_told(tmp_path: Path, name: str) -> None:
     assert "give a writable folder with --out" in refusal(places[name])
 
 
-def test_a_read_only_store_is_told() -> None:
+def test_a_read_only_store_is_reported() -> None:
     """Root ignores permissions, so a child that gave them up tries it."""
     code = (
         "import os, sys\n"
@@ -162,7 +162,7 @@ def test_a_read_only_store_is_told() -> None:
     assert len(done.stdout.splitlines()) == 1
 
 
-def test_a_lock_that_lasts_is_told(tmp_path: Path) -> None:
+def test_a_lock_that_lasts_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
     use(path)
     holder = sqlite3.connect(path, isolation_level=None)

@@ -115,7 +115,7 @@ def reported(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("address", ["", "here", "tcp://127.0.0.1", "127.0.0.1:8786"])
-def test_what_is_no_address_is_told(
+def test_what_is_no_address_is_reported(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = reported(address, tmp_path, capsys)
@@ -123,14 +123,14 @@ def test_what_is_no_address_is_told(
 
 
 @pytest.mark.parametrize("kind", ["tcp://127.0.0.1:{}", "tcp://127.0.0.1:99999", "carrier://a:{}"])
-def test_an_address_where_nothing_answers_is_told(kind: str, tmp_path: Path) -> None:
+def test_an_address_where_nothing_answers_is_reported(kind: str, tmp_path: Path) -> None:
     address = kind.format(Processes(tmp_path).port)
     words = rf"--scheduler {address}: no Dask scheduler answers there \(.+\); start"
     with pytest.raises(UserError, match=words):
         Cluster(address, options=ClusterOptions(connect=0.3)).__enter__()
 
 
-def test_without_dask_the_remedy_is_told(
+def test_without_dask_the_remedy_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)

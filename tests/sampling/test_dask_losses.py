@@ -107,7 +107,7 @@ def test_killed_workers_lose_no_sample_and_double_none(nannies: Processes, tmp_p
     assert table(path) == serial(tmp_path / "serial.sqlite", np.vstack(batches))
 
 
-def test_a_cluster_that_stays_away_is_told(shared: Processes, tmp_path: Path) -> None:
+def test_a_cluster_that_stays_away_is_reported(shared: Processes, tmp_path: Path) -> None:
     tasks = [(i, str(tmp_path / "never")) for i in range(4)]
     with Cluster(shared.address, absence=1.0) as cluster:
         for process in shared.started:
@@ -124,7 +124,7 @@ def test_a_cluster_that_stays_away_is_told(shared: Processes, tmp_path: Path) ->
             list(results)
 
 
-def test_a_task_that_kills_every_worker_is_told(nannies: Processes) -> None:
+def test_a_task_that_kills_every_worker_is_reported(nannies: Processes) -> None:
     with Cluster(nannies.address) as cluster, pytest.raises(WorkerLost, match="after worker died"):
         list(cluster.map_unordered(dies_at_two, range(8)))
 

@@ -185,7 +185,7 @@ def test_equal_tasks_are_not_taken_for_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("started")
-def test_a_task_that_kills_twice_is_told() -> None:
+def test_a_task_that_kills_twice_is_reported() -> None:
     with Workers(2) as workers, pytest.raises(WorkerLost, match="died twice") as caught:
         list(workers.map_unordered(dies, range(8)))
     assert len(str(caught.value)) < 400

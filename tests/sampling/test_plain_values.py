@@ -10,7 +10,7 @@ import pytest
 
 from ccd_casadi.sampling.store import SampleStore, SampleStoreError
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import plain, restored
+from ccd_casadi.support.json_files import plain, restore
 
 
 class Colour(Enum):
@@ -49,7 +49,7 @@ def whole() -> Whole:
 def test_every_bit_comes_back() -> None:
     given = whole()
     text = json.dumps(plain(given), allow_nan=False)
-    found = restored(Whole, json.loads(text))
+    found = restore(Whole, json.loads(text))
     for item in fields(Whole):
         here, there = getattr(given, item.name), getattr(found, item.name)
         assert repr(there) == repr(here).replace("np.float64(0.1)", "0.1"), item.name
@@ -60,10 +60,10 @@ def test_every_bit_comes_back() -> None:
 def test_a_class_that_had_another_name_comes_back() -> None:
     """Only where a field may be of several classes does the stored name tell which."""
     data = {**plain(whole()), "maybe": {"": "OneOfBefore", "x": 2.0}}
-    assert restored(Whole, data).maybe == One(2.0)
+    assert restore(Whole, data).maybe == One(2.0)
 
 
-def test_what_is_damaged_is_told(tmp_path: Path) -> None:
+def test_what_is_damaged_is_reported(tmp_path: Path) -> None:
     wrong = [
         {**plain(whole()), name: value}
         for name, value in [

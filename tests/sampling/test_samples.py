@@ -67,7 +67,7 @@ def exact(value: Any) -> Any:
 
 @few(max_examples=100)
 @given(st.lists(finite, min_size=3, max_size=5), st.integers(0, 4), st.booleans())
-def test_key_tells_neighbouring_floats_apart(values: list[float], place: int, up: bool) -> None:
+def test_key_reports_neighbouring_floats_apart(values: list[float], place: int, up: bool) -> None:
     place %= len(values)
     moved = list(values)
     moved[place] = math.nextafter(values[place], math.inf if up else -math.inf)
@@ -149,7 +149,7 @@ def test_known_rows_stay_and_only_gain_gradients(tmp_path: Path) -> None:
     assert found["k"].gradients == (4.0, 5.0)
 
 
-def test_rows_are_ordered_and_thousands_of_keys_can_be_asked_for(tmp_path: Path) -> None:
+def test_rows_are_ordered_and_thousands_of_keys_can_be_required(tmp_path: Path) -> None:
     rows = [
         sample(f"k{i}", theta=(float(-i % 7), float(i)), omega_S=float(i % 3)) for i in range(1203)
     ]

@@ -179,7 +179,7 @@ def test_theta_is_all_but_the_last_two_however_many_there_are(
 def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, violated: bool
 ) -> None:
-    monkeypatch.setattr(module, "violated", lambda *_: ("least mass",) * violated)
+    monkeypatch.setattr(module, "violations", lambda *_: ("least mass",) * violated)
     monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=-3.0), store, Workers(1))
@@ -195,7 +195,7 @@ def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     assert math.isnan(sampler.trace[1].objective)
 
 
-def test_a_trace_tells_bandwidths_where_j_counts_an_error(
+def test_a_trace_reports_bandwidths_where_j_counts_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It had the error, in m, for the bandwidth."""

@@ -59,7 +59,7 @@ def test_a_module_does_not_take_the_place_of_the_function_of_its_name() -> None:
     subprocess.run([sys.executable, "-c", words], check=True)
 
 
-def test_the_result_is_told_and_on_disk_before_the_report_is_drawn(
+def test_the_result_is_reported_and_on_disk_before_the_report_is_drawn(
     two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

@@ -24,7 +24,7 @@ from ccd_casadi.extensions.schedule.segments import (
     DesignedPart,
     ScheduleOptions,
     Segment,
-    halved,
+    halve,
     scheduled_name,
     share_of,
     within,
@@ -153,14 +153,14 @@ def test_halving_ends_where_every_part_has_its_share() -> None:
         assert warm is None or warm.bandwidth <= found
         return DesignedPart(low, high, cast(Any, None), cast(Any, SimpleNamespace(bandwidth=found)))
 
-    parts = halved(search(0.0, 1.0), alone, search, options=ScheduleOptions(most=64))
+    parts = halve(search(0.0, 1.0), alone, search, options=ScheduleOptions(most=64))
     assert parts[0].low == 0.0
     assert parts[-1].high == 1.0
     assert min(share_of(part, alone) for part in parts) >= 0.9
     for one, other in pairwise(parts):
         assert one.low < other.low < one.high < other.high  # they overlap
     assert len(searched) == 2 * len(parts) - 1
-    few = halved(search(0.0, 1.0), alone, search, options=ScheduleOptions(most=3))
+    few = halve(search(0.0, 1.0), alone, search, options=ScheduleOptions(most=3))
     assert len(few) == 3
 
 

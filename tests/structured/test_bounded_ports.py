@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import nearby, plants_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.kernels.sections import LoopCurve
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.lti.wiring import Filters, ForcedPlant, OwnPorts, Wiring
 from ccd_casadi.plants.plant import Mechanics
@@ -416,7 +416,7 @@ def test_the_other_damping_and_code_are_judged_at_the_ports(tmp_path: Path) -> N
     own = uncertain_plant(problem, problem.start).as_written(corners)
     assert found.own["GS"] == pytest.approx(shares(certify(own, K, BOUNDS, run)), rel=1e-6)
     plant = plants_of(problem, problem.start)[0].plant_si()
-    moves = sampled_compliance(plant, sampled(plant, run.period, run.delay), tustin(K, run.period),
+    moves = sampled_compliance(plant, zoh(plant, run.period, run.delay), tustin(K, run.period),
                                delay=run.delay)  # fmt: skip
     judged = certify(plants_of_set(problem, problem.start)[:1], K, BOUNDS, run)
     assert moves == pytest.approx(judged.plants[0].GS, rel=1e-6)

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from ccd_casadi.budget import evaluation
-from ccd_casadi.budget.error_density import integrated
+from ccd_casadi.budget.error_density import integrate_densities
 from ccd_casadi.budget.evaluation import (
     COMPLEX_STEP,
     ErrorVariance,
@@ -107,7 +107,7 @@ def test_lyapunov_equals_the_integral_over_frequency(sampling: Sampling | None) 
     period = None if sampling is None else sampling.period
     for source in SHAPED:
         found = by_lyapunov(made, source, WINDOW)
-        whole = integrated(made, source, lambda hz: average_gain(hz, WINDOW, period))
+        whole = integrate_densities(made, source, lambda hz: average_gain(hz, WINDOW, period))
         expected = [whole.value[0], whole.value[2], whole.value[1]]
         np.testing.assert_allclose(
             [found.error, found.average, found.force], expected, rtol=1e-9, err_msg=source.name

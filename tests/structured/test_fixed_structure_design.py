@@ -10,7 +10,7 @@ from oracles.helpers import HZ, SUSPENSION, random_plant, responses, two_mass_mo
 
 from ccd_casadi.fixed_structure import certificate
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.certificate import JudgeOptions, certify, judged
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, certify, judge_plants
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import (
     SectionsOutcome,
@@ -27,7 +27,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     LoopOnBox,
     WorstPlantOptions,
-    climbed,
+    climb,
     lattice,
     worst_plants,
 )
@@ -316,7 +316,7 @@ def test_plants_are_assessed_alike_by_any_number_of_workers(design) -> None:
     required = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
     points = lattice(box, 60, 7)
     assert len(points) > WorstPlantOptions.batch
-    whole = required.assessed(box.plants(points)).largest
+    whole = required.assess(box.plants(points)).largest
     with Workers(2) as workers:
         spread = required.excesses(points, workers)
     assert (spread == required.excesses(points)).all()
@@ -327,7 +327,7 @@ def test_far_within_all_bounds_the_worst_plant_is_named_too(design) -> None:
     box = uncertain(mode_shift=1e-3, gain=1e-3)
     required = LoopOnBox(box, SMALL, design.kappa, 0.5 * design.bandwidth, EASY.looser(10.0))
     points = lattice(box, 12, 0)
-    heads, _ = climbed(required, points)
+    heads, _ = climb(required, points)
     assert heads[0].value < 0.0
     assert heads[0].value >= required.excesses(points).max() - 1e-6
 
@@ -386,12 +386,12 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
     K = StateSpace(np.array([[-300.0]]), np.array([[1.0]]), np.array([[2e4]]), np.zeros((1, 1)))
     bounds = Bounds(S_max=3.0, S_low=0.9, omega_low=HZ, shape=None)
     alone = scale_state_space(StateSpace(A[:2, :2], B[:2], C[:, :2], np.zeros((1, 1))), 1.0)
-    assert judged([alone.plant_si()], K, bounds, sampling, False)[0].stable
+    assert judge_plants([alone.plant_si()], K, bounds, sampling, False)[0].stable
     for _ in range(20):
         T = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         turned = StateSpace(T @ A @ T.T, T @ B, C @ T.T, np.zeros((1, 1)))
         other = scale_state_space(turned, 1.0)
-        assert not judged([other.plant_si()], K, bounds, sampling, False)[0].stable
+        assert not judge_plants([other.plant_si()], K, bounds, sampling, False)[0].stable
 
 
 def test_plants_judged_together_are_each_as_alone(design) -> None:

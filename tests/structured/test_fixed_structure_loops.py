@@ -36,7 +36,7 @@ from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops, plant
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import sections
-from ccd_casadi.lti.loop import Sampling, in_w, sampled
+from ccd_casadi.lti.loop import Sampling, in_w, zoh
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import PlantError
@@ -101,7 +101,7 @@ def test_the_modal_response_is_that_of_the_matrices(sampling: Sampling | None) -
     for i, member in enumerate(members.systems):
         if sampling is not None:  # by one exponential of the matrices
             own, T = members.plants[i].system, members.period
-            held = in_w(sampled(own, T, members.delay))
+            held = in_w(zoh(own, T, members.delay))
             np.testing.assert_allclose(member.response(v), held.response(v), rtol=1e-8)
         G, slope = (part[:, 0, 0] for part in members.responses(np.full(len(v), i), v))
         solved = np.linalg.solve(1j * v[:, None, None] * np.eye(len(member.A)) - member.A,
@@ -121,7 +121,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     si = problem.structure.in_units(kappa, members.omega_0, members.force)
     conversion = Conversion.TUSTIN
     K = discretise(problem.structure.state_space(si), conversion, sampling.period, sampling.delay)
-    S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
+    S = closed_loop(zoh(plant().plant_si(), sampling.period, sampling.delay), K).S
     w = found.poles[0] * 0.5 * members.period
     z = np.sort(np.abs((1.0 + w) / (1.0 - w)))
     np.testing.assert_allclose(z, np.sort(np.abs(np.linalg.eigvals(S.A)))[-len(z) :], atol=1e-6)

@@ -218,7 +218,7 @@ def test_words_name_a_bound_as_a_reader_knows_it(curve: LoopCurve) -> None:
         proof = Proof(ProofOutcome.OPEN, 1e-3, ("damping",), {row: 1.03}, point=(0.5,),
                       exceeded=(row, 1.03))  # fmt: skip
         said = [replace(proof, outcome=outcome).words for outcome in ProofOutcome]
-        said += [BOUNDS.missed(row, 1.41), key_words(row), *bound_words([row])]
+        said += [BOUNDS.missed_words(row, 1.41), key_words(row), *bound_words([row])]
         for words in said:
             plain = reduce(lambda text, name: text.replace(name, ""), known, words)
             names = {one.name for kind in (LoopCurve, ProofOutcome, Chart) for one in kind}

@@ -21,7 +21,7 @@ from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum, UncertainPlant, modal_sum
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes
@@ -64,7 +64,7 @@ def direct(theta: Array, omega: Array, sampling: Sampling | None) -> np.ndarray:
     G = as_written(mechanics(PLANT, theta))
     if sampling is None:
         return G.at(1j * omega)
-    held = sampled(G, sampling.period, sampling.delay)
+    held = zoh(G, sampling.period, sampling.delay)
     return held.at(np.exp(1j * omega * sampling.period))
 
 
@@ -125,7 +125,7 @@ def test_free_bodies_are_enclosed_as_they_answer_also_at_rest(sampling) -> None:
             free = -1.0 / omega**2
             held = free
             if period is not None:
-                held = sampled(body, period, delay).at(np.exp(1j * np.array([f])))[0, 0, 0]
+                held = zoh(body, period, delay).at(np.exp(1j * np.array([f])))[0, 0, 0]
             own = axis[i > 0]
             assert within(own.free_body, i, t, times * held)
             assert within(own.free_body_unheld, i, t, times * free)

@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
-from ccd_casadi.synthesis.second_engine import SecondEngineOptions, compared, second_opinion
+from ccd_casadi.synthesis.second_engine import SecondEngineOptions, compare_engines, second_opinion
 
 AGREEMENT = SecondEngineOptions().agreement
 WIDE = replace(BOUNDS, S_max=50.0, weighted_level=1e6, compliance_max=1.0)
@@ -88,8 +88,8 @@ def test_the_second_engine_denies_a_false_claim(name: str, sampling: Sampling | 
     true = found.norms[name] if of is None else hinf_norm(of)[0]
     assert not found.contradictions(**{name: true})
     assert found.contradictions(**{name: true * (1.0 - 3.0 * AGREEMENT)})
-    assert compared([(found, {name: 0.99 * true})]).agrees is False
-    assert compared([(found, {name: float("nan")})]).agrees is False
+    assert compare_engines([(found, {name: 0.99 * true})]).agrees is False
+    assert compare_engines([(found, {name: float("nan")})]).agrees is False
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e4, 1e8])

@@ -149,7 +149,7 @@ def test_as_written_answers_as_the_modes_do(off: Perturbation) -> None:
     np.testing.assert_allclose((ends[1] - ends[0]) / (2.0 * h), exact, rtol=2e-5)
 
 
-def test_a_pole_too_fast_for_the_delay_is_told_before_a_search(tmp_path) -> None:
+def test_a_pole_too_fast_for_the_delay_is_reported_before_a_search(tmp_path) -> None:
     plant = (
         "def axis(theta):\n"
         "    k = (2 * 3.141592653589793 * theta['pole']) ** 2\n"

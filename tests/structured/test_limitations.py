@@ -41,9 +41,9 @@ from ccd_casadi.extensions.limitations.of_problem import (
     opposite_corners,
 )
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.certificate import judged
+from ccd_casadi.fixed_structure.certificate import judge_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import scale_state_space
@@ -137,7 +137,7 @@ def test_on_an_interval_the_discs_hold_every_loop_that_keeps_the_bounds(
     start: float, width: float, shift: float, seed: int
 ) -> None:
     """Any T that keeps the bounds on both plants at some v lies in the discs of the interval."""
-    held = [sampled(lag(zero), 0.05, 0.03) for zero in (20.0, 20.0 * (1.0 + shift))]
+    held = [zoh(lag(zero), 0.05, 0.03) for zero in (20.0, 20.0 * (1.0 + shift))]
     bounds = Bounds(1.8, 0.9, 1e-3, shape=1.1)
     one, other = (
         limits_of(lag(z), bounds, Sampling(20.0, 30_000.0)) for z in (20.0, 20.0 * (1.0 + shift))
@@ -188,7 +188,7 @@ def test_functions_are_analytic_and_small_at_the_end() -> None:
 @settings(max_examples=40, deadline=None)
 def test_a_response_stays_in_its_range(zero: float, width: float, delay: float, hold: bool) -> None:
     plant, T = lag(zero), 0.05
-    held = sampled(plant, T, delay * T) if hold else plant
+    held = zoh(plant, T, delay * T) if hold else plant
     found = response_of(held)
     assert found is not None
     v = np.linspace(1.0, 1.0 + width, 300)
@@ -313,7 +313,7 @@ def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     )
     controller = recertified_in_si(plant, made, omega_low).controller
     loose = Bounds(50.0, 1.0, omega_low, weighted_level=1e9, weights=weights)
-    loop = judged([plant.plant_si()], controller, loose, None, False)[0]
+    loop = judge_plants([plant.plant_si()], controller, loose, None, False)[0]
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
     bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, omega_low, None, level, weights)
     assert loop.crossing <= upper_bound(limits_of(plant.plant_si(), bounds, None)) < np.inf
@@ -333,7 +333,7 @@ def test_no_design_of_an_unstable_plant_exceeds_the_bound_or_the_least_peaks(see
     made = synthesise(plant, weights, omega_low=1e-2 * w0)
     controller = recertified_in_si(plant, made, 1e-2 * w0).controller
     loose = Bounds(50.0, 1.0, 1e-2 * w0, weighted_level=1e9, weights=weights)
-    loop = judged([plant.plant_si()], controller, loose, None, False)[0]
+    loop = judge_plants([plant.plant_si()], controller, loose, None, False)[0]
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
     bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, 1e-2 * w0, None, level, weights)
     limits = limits_of(plant.plant_si(), bounds, None)

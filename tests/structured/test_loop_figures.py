@@ -244,7 +244,7 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])
-def test_a_loop_that_rings_near_its_bandwidth_is_told(sampling: Sampling | None) -> None:
+def test_a_loop_that_rings_near_its_bandwidth_is_reported(sampling: Sampling | None) -> None:
     """K = ω²m turns a free mass with little damping into an oscillator at ω: damping and place."""
     w, mass = 20.0 * HZ, 3.0
 

@@ -18,7 +18,7 @@ from ccd_casadi.fixed_structure.discs import RankOneDiscs, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
@@ -157,7 +157,7 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
             free = BOX.plant(at[1:]).plant_si()
             G, own = free, K
             if sampling is not None:
-                G, own = sampled(free, sampling.period, sampling.delay), tustin(K, sampling.period)
+                G, own = zoh(free, sampling.period, sampling.delay), tustin(K, sampling.period)
             table = LoopResponses([free], [G], own, sampling, bounds)
             table = table.at(np.array([0]), at[None, :1])
             for name, (figure, limit) in limits.items():

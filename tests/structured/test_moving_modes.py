@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.fixed_structure.worst_plant import lattice
-from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.loop import tustin, zoh
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
 
@@ -130,7 +130,7 @@ def test_enclosures_hold_the_loop_at_every_position(sampling) -> None:
         w, *point = low[:, n] + rng.choice([0.0, 0.4, 1.0], 3) * (high - low)[:, n]
         G, own, at = BOX.plant(np.array(point)).plant_si(), K, np.array([w])
         if sampling is not None:
-            G, own = sampled(G, sampling.period, sampling.delay), tustin(K, sampling.period)
+            G, own = zoh(G, sampling.period, sampling.delay), tustin(K, sampling.period)
             at = np.exp(1j * at * sampling.period)
             L = (G.C @ np.linalg.solve(at[0] * np.eye(len(G.A)) - G.A, G.B)) * (
                 own.C @ np.linalg.solve(at[0] * np.eye(len(own.A)) - own.A, own.B) + own.D

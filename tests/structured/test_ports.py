@@ -14,7 +14,7 @@ from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.codesign.result_entries import move_entry
 from ccd_casadi.codesign.survival import loops_of, survival
 from ccd_casadi.deployment.on_hardware import move
-from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.deployment.realisation import realise_blocks
 from ccd_casadi.drive import main as drive
 from ccd_casadi.explore import main as explore
 from ccd_casadi.inner_problem.kinds import design_loops, loop_budget, member_loops
@@ -171,7 +171,8 @@ def test_compliance_is_that_of_the_dynamic_stiffness(
     C = np.array([[1.0, 0, 0], [0, 0, 1.0]])[:sensors]
     s = 1j * np.geomspace(0.1, 1e5, 40_000)
     own = F @ closed(s, K, C) @ E
-    np.testing.assert_allclose(loop.moved(s.imag), own, rtol=0, atol=1e-7 * np.abs(own).max())
+    atol = 1e-7 * np.abs(own).max()
+    np.testing.assert_allclose(loop.force_responses(s.imag), own, rtol=0, atol=atol)
     most, rest, low, hz = compliance_of([loop], HZ)
     assert most == pytest.approx(sigma_max(own).max(), rel=1e-5)
     at = sigma_max(F @ closed(1j * np.array([1e-6 * HZ, HZ]), K, C) @ E)
@@ -179,7 +180,8 @@ def test_compliance_is_that_of_the_dynamic_stiffness(
     assert hz == pytest.approx(1.0)
     found = statics(loop.plant, K, bandwidth=100.0, omega_low=HZ, places=loop.at, ports=loop.ports)
     np.testing.assert_allclose([found.compliance, found.low], [rest, low], rtol=1e-6)
-    np.testing.assert_allclose(loop.curves(s.imag[::100])["GS"], loop.moved(s.imag[::100]))
+    omega = s.imag[::100]
+    np.testing.assert_allclose(loop.curves(omega)["GS"], loop.force_responses(omega))
     assert loop.closed.GS.D.shape == (1, 2)
     np.testing.assert_allclose(loop.closed.GS.response(s.imag[::100]), own[::100], rtol=0,
                                atol=1e-7 * np.abs(own).max())  # fmt: skip
@@ -263,7 +265,7 @@ def test_a_sampled_move_and_its_noise_are_the_tools(tmp_path: Path) -> None:
     X[:6] += now @ X[6:7]
     enters[:6] += now * enters[6]
     (loop,) = design_loops(problem, problem.start, K)[:1]
-    made = move(loop.plant, realised(Kz), DELAY, profile, ports=loop.ports)
+    made = move(loop.plant, realise_blocks(Kz), DELAY, profile, ports=loop.ports)
     own = simulated(Kz, profile.at(made.time)[0], np.zeros(len(made.time)))
     np.testing.assert_allclose(made.error[:, 0], own, rtol=0, atol=1e-11)  # measured 2e-12
     white = loop_noise(loop)
@@ -295,7 +297,7 @@ def test_a_plant_without_ports_is_as_it_was(tmp_path: Path) -> None:
     assert not loop.ported
     s = 1j * np.geomspace(1.0, 1e4, 300)
     own = closed(s, controller(), np.array([[1.0, 0, 0]]))[:, :1, :1]
-    np.testing.assert_allclose(loop.moved(s.imag), own, rtol=1e-6)
+    np.testing.assert_allclose(loop.force_responses(s.imag), own, rtol=1e-6)
     np.testing.assert_allclose(loop.curves(s.imag)["GS"], own, rtol=1e-6)
 
 

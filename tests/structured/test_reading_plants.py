@@ -12,7 +12,7 @@ from test_tune import judged, response_at
 import ccd_casadi as ccd
 from ccd_casadi.extensions.measured.measured_design import design_on_data
 from ccd_casadi.extensions.measured.measured_loop import controller_response, judge
-from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.loop import tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
@@ -140,7 +140,7 @@ def test_a_pole_on_the_axis_is_refused_for_that(plant: object) -> None:
     assert made.figures.certified
 
 
-def test_hidden_modes_and_zeros_are_told_apart() -> None:
+def test_hidden_modes_and_zeros_are_reported_apart() -> None:
     """A mode that is not stable and not driven, or not seen; a zero of the transfer at 0."""
     A = np.diag([2.0, -1.0])
     one, off = np.array([[1.0], [1.0]]), np.array([[0.0], [1.0]])
@@ -225,7 +225,7 @@ def hidden_case(seed: int) -> tuple[StateSpace, MeasuredResponse]:
     i = int(np.searchsorted(hz, at))
     at = hz[i] + rng.uniform(0.1, 0.9) * (hz[i + 1] - hz[i])
     residue = rng.choice([-1.0, 1.0]) * 10.0 ** rng.uniform(-6.0, -3.0)
-    G = sampled(modal([(0.2, 0.0, 0.0), (0.06, ccd.HZ * 250.0, 10.0 ** rng.uniform(-2.3, -1.5)),
+    G = zoh(modal([(0.2, 0.0, 0.0), (0.06, ccd.HZ * 250.0, 10.0 ** rng.uniform(-2.3, -1.5)),
                        (residue, ccd.HZ * at, 10.0 ** rng.uniform(-3.3, -2.0))]),
                 1.0 / RATE, 2.0 / RATE)  # fmt: skip
     noise = rng.choice([0.0, 0.0, 1e-3, 1e-2]) * np.sqrt(0.5)
@@ -254,7 +254,7 @@ def test_no_loop_is_sure_that_a_hidden_resonance_makes_unstable() -> None:
 
 def test_the_bound_between_lines_falls_as_lines_are_added() -> None:
     """To the truth without noise, and to what noise leaves with it; where it is, is stated."""
-    G = sampled(modal([(0.2, 10.0, 0.5), (0.06, ccd.HZ * 250.0, 0.02)]), 1.0 / RATE, 2.0 / RATE)
+    G = zoh(modal([(0.2, 10.0, 0.5), (0.06, ccd.HZ * 250.0, 0.02)]), 1.0 / RATE, 2.0 / RATE)
 
     def lines(step: float, noise: float) -> MeasuredResponse:
         rng = np.random.default_rng(7)

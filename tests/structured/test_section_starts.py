@@ -16,9 +16,9 @@ from ccd_casadi.fixed_structure.multi_start import (
     MultiStartOptions,
     at_its_bandwidth,
     distinct,
-    reinserted,
+    reinsert,
     search_from_starts,
-    started,
+    start_at,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redraw_section, stabilising
 from ccd_casadi.fixed_structure.structure import Structure
@@ -84,7 +84,7 @@ def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
     problem = problem_for([two_mass(60.0, 60.0)], Structure(biquads=0), bounds)
     inside = 0
     for kappa in stabilising(problem, by_rules(problem, np.geomspace(0.01, 0.3, 8))):
-        point = started(problem, kappa)
+        point = start_at(problem, kappa)
         assert np.log(problem.low) <= point.tau <= problem.begin(kappa)
         lowered = point.tau < problem.begin(kappa)
         assert not lowered or point.assessment.violation <= MultiStartOptions.violation
@@ -104,7 +104,7 @@ def test_a_section_that_is_put_elsewhere_cancels_there(seed: int) -> None:
     problem = problem_for([plant()], structure, BOUNDS)
     start = Point(kappa, -3.0, assess(problem, kappa, -3.0))
     s = 1j * np.geomspace(1e-3, 30.0, 60)
-    moved, without = reinserted(problem, [start])
+    moved, without = reinsert(problem, [start])
     whole = structure.response(kappa, s)
     np.testing.assert_allclose(structure.response(moved, s), whole, rtol=1e-9)
     assert (moved != kappa).sum() == 2 + seed % 2
@@ -116,7 +116,7 @@ def test_a_section_that_is_put_elsewhere_cancels_there(seed: int) -> None:
 def test_a_gain_alone_has_nothing_to_put_elsewhere() -> None:
     problem, kappa = loop(0, Structure(False, lead=0, biquads=0, roll_off=0))
     start = Point(kappa, -3.0, assess(problem, kappa, -3.0))
-    assert reinserted(problem, [start]).shape == (0, 1)
+    assert reinsert(problem, [start]).shape == (0, 1)
 
 
 def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
@@ -131,7 +131,7 @@ def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
     kappa = np.insert(one.kappa, 4, np.full(2, more.box[0, 1]))
     end = at_its_bandwidth(more, kappa)
     assert end.tau == pytest.approx(one.tau, abs=MultiStartOptions.same)
-    (moved,) = reinserted(more, [end])
+    (moved,) = reinsert(more, [end])
     start = at_its_bandwidth(more, moved)
     assert start.tau == pytest.approx(one.tau, abs=MultiStartOptions.same)
     better = ascend(more, start, iterations=40).point

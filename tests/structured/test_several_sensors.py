@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.break_points import SensorFamily
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.channel_design import _scaled
+from ccd_casadi.fixed_structure.channel_design import _scale
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
     given_decoupling,
@@ -91,7 +91,7 @@ def test_values_and_slopes_of_every_place_are_those_of_its_fraction(
     weights = ccd.Weights(M_S=2.0, A_S=1e-3, omega_S=60.0, c_K=1e3, omega_K=3e3, M_K=1e4,
                           A_l=1.0, A_u=1e-2, omega_T=3e3)  # fmt: skip
     limits = bounds(compliance_max=1e-4, weighted_level=2.0, weights=weights)
-    scaled = _scaled(control.ss(plant.A, plant.B, plant.C, plant.D), limits, None)
+    scaled = _scale(control.ss(plant.A, plant.B, plant.C, plant.D), limits, None)
     problem = problem_for(scaled, SECTIONS, limits, sampling).parts[0].problem
     kappa = np.random.default_rng(1).normal(0.0, 0.4, len(SECTIONS.names))
     v, step = np.array([0.2, 1.0, 4.0, 7.0]), 1e-6
@@ -334,7 +334,7 @@ def test_a_sensor_may_have_any_unit(units: tuple[float, float]) -> None:
     shift[[SECTIONS.names.index(name) for name in names]] = -np.log(units)
     found = []
     for C in (plant.C, np.diag(units) @ plant.C):
-        scaled = _scaled(control.ss(plant.A, plant.B, C, plant.D), bounds(), 1e4)
+        scaled = _scale(control.ss(plant.A, plant.B, C, plant.D), bounds(), 1e4)
         problem = problem_for(scaled, SECTIONS, bounds(), RATE)
         alike = in_search_units(scaled, bounds())
         starts = actuator_starts(problem, SECTIONS, alike, RATE, 3, rng(0))

@@ -23,7 +23,7 @@ from ccd_casadi.extensions.measured import main, tuned_plants, tuning
 from ccd_casadi.extensions.measured.line_problem import line_problem
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import judge_lines, judge_loops
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
@@ -102,10 +102,10 @@ def test_a_controller_of_steep_leads_keeps_the_digits_of_S(seed: int) -> None:
             kappa[i] = np.log(rng.uniform(0.1, 1.0))
     G = StateSpace(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]),
                    np.array([[1.0, 0.0]]), np.zeros((1, 1)))  # fmt: skip
-    held = sampled(G, period, 0.0)
-    first = tustin(structure.state_space(kappa).balanced(), period)
+    held = zoh(G, period, 0.0)
+    first = tustin(structure.state_space(kappa).balance(), period)
     kappa[0] -= np.log(np.abs((held.response(middle) * first.response(middle)).item()))
-    K = tustin(structure.state_space(kappa).balanced(), period)
+    K = tustin(structure.state_space(kappa).balance(), period)
     by_product = 1.0 / (1.0 + held.response(omega) * K.response(omega))[:, 0, 0]
     by_matrices = closed_loop(held, K).S.response(omega)[:, 0, 0]
     np.testing.assert_allclose(by_matrices, by_product, rtol=1e-7)
@@ -316,7 +316,7 @@ def test_what_is_written_is_judged_however_far_it_is_from_the_controller(
     K, bounds, rate = found.controller, found.case.bounds, 8000.0
     assert K is not None
     assert found.design.usable
-    right = tuning.realised(tustin(K, 1.0 / rate)).as_coded
+    right = tuning.realise_blocks(tustin(K, 1.0 / rate)).as_coded
     coded = replace(right, C=(1.0 + off) * right.C, D=(1.0 + off) * right.D)
     judge = judge_loops([plant], K, coded, bounds, Sampling(rate), found.design.bandwidth, True)
     peak = judged(control.ss(*(getattr(plant, part) for part in "ABCD")),

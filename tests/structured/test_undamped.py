@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.fixed_structure import Bounds, Sampling
-from ccd_casadi.fixed_structure.certificate import judged
+from ccd_casadi.fixed_structure.certificate import judge_plants
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant, require_damping
@@ -26,7 +26,7 @@ def two_masses(damping: float, force: float = 1.0, sensor: float = 1.0) -> Mecha
 @pytest.mark.parametrize("sampling", [None, Sampling(40.0, 5_000.0)])
 def test_figures_are_the_limit_of_ever_less_damping(sampling: Sampling | None) -> None:
     plants = [modal_plant(two_masses(d), FREE).state_space for d in (0.0, 1e-7, 1e-2)]
-    none, little, more = (judged([own], K, BOUNDS, sampling, False)[0] for own in plants)
+    none, little, more = (judge_plants([own], K, BOUNDS, sampling, False)[0] for own in plants)
     assert none.stable
     for name in ("S_peak", "KS", "T", "GS", "crossing"):
         assert getattr(none, name) == pytest.approx(getattr(little, name), rel=1e-4)

@@ -13,7 +13,7 @@ from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.codesign.result_entries import move_entry
 from ccd_casadi.codesign.survival import loops_of, survival
 from ccd_casadi.deployment.on_hardware import move
-from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.deployment.realisation import realise_blocks
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.certificate import certify
@@ -180,7 +180,8 @@ def test_compliance_and_budget_are_those_of_the_machine(
     at = 1 if ports else 0
     omega = np.geomspace(1.0, 0.99 * np.pi * RATE, 3000)
     own = responses(omega, K, run)["d"][:, 1 + at, at]
-    np.testing.assert_allclose(loop.moved(omega)[:, 0, 0], own, rtol=0, atol=1e-6 * abs(own).max())
+    atol = 1e-6 * abs(own).max()
+    np.testing.assert_allclose(loop.force_responses(omega)[:, 0, 0], own, rtol=0, atol=atol)
     assert loop.compliance == pytest.approx(abs(own).max(), rel=1e-3)
     found = loop_budget(problem, problem.start, K)
     assert found is not None
@@ -239,7 +240,7 @@ def test_a_move_has_the_amplifiers_force_and_its_command(tmp_path: Path) -> None
     outside = np.flatnonzero(np.abs(error) > found["window"])
     assert found["settled"] == pytest.approx(time[outside[-1] + 1], abs=1.01 * T)
     (loop,) = design_loops(problem, problem.start, K)[:1]
-    made = move(loop.plant, realised(Kz), DELAY, profile, ports=loop.ports)
+    made = move(loop.plant, realise_blocks(Kz), DELAY, profile, ports=loop.ports)
     own = simulated(Kz, profile.at(made.time)[0], np.zeros(len(made.time)))
     for value, exact in zip((made.error, made.force, made.command), own, strict=True):
         np.testing.assert_allclose(value[:, 0], exact, rtol=0, atol=1e-7 * np.abs(exact).max())
@@ -359,7 +360,8 @@ def test_of_two_sensors_the_position_of_the_one_that_counts_is_moved(tmp_path: P
     sensors = [0, 4]
     sent = np.linalg.solve(np.eye(1) + k @ u[:, sensors], k @ d[:, sensors])
     own = (d[:, [1]] - u[:, [1]] @ sent)[:, 0, 0]
-    np.testing.assert_allclose(loop.moved(omega)[:, 0, 0], own, rtol=0, atol=1e-6 * abs(own).max())
+    atol = 1e-6 * abs(own).max()
+    np.testing.assert_allclose(loop.force_responses(omega)[:, 0, 0], own, rtol=0, atol=atol)
     assert loop.ports.wanted == pytest.approx(np.ones((1, 1)), abs=1e-8)
     late = DELAY + 0.5 / RATE + 1.4 / (HZ * 2000.0) + 1.0 / (HZ * 5000.0)  # of the table's filter
     forward = motion_of(problem, problem.start).forward

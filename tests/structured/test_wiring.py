@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.wiring import Filters, Wiring
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, modal_plant
@@ -66,13 +66,13 @@ def test_responses_and_their_slopes_are_those_of_the_matrices(name: str, run: Sa
         omega = HZ * np.geomspace(0.5, 900.0, 30)
         at, which = P.variable(omega / plant.omega_0), np.zeros(30, int)
         written = as_written(chain(0.0, wiring, braked))
-        held = written if run is None else sampled(written, run.period, run.delay)
+        held = written if run is None else zoh(written, run.period, run.delay)
         G = P.responses(which, at)[0][:, 0, 0] / plant.force
         np.testing.assert_allclose(G, held.response(omega)[:, 0, 0], rtol=1e-9)
 
         def moved(t: float, braked: float = braked, omega: np.ndarray = omega) -> np.ndarray:
             own = scaled(chain(t, WIRINGS[name], braked)).plant_si()
-            own = own if run is None else sampled(own, run.period, run.delay)
+            own = own if run is None else zoh(own, run.period, run.delay)
             return own.response(omega)[:, 0, 0]
 
         slope = (moved(1e-5) - moved(-1e-5)) / 2e-5
@@ -153,7 +153,7 @@ omega_low_hz = 1.0
         ("[sensor]\nsecond_order_hz = 1e3\ndamping = 1e9", "give a damping ratio from 0.001"),
     ],
 )
-def test_what_a_wiring_cannot_be_is_told_by_key(tmp_path, table: str, words: str) -> None:
+def test_what_a_wiring_cannot_be_is_reported_by_key(tmp_path, table: str, words: str) -> None:
     path = tmp_path / "case.toml"
     path.write_text(f"{CASE}{table}\n")
     with pytest.raises(CaseError) as caught:

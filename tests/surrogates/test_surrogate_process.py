@@ -22,7 +22,7 @@ from surrogates import (
     quality_of,
 )
 from surrogates.covariance import covariance, observed_covariance
-from surrogates.fitting import calibrated, recalibrated
+from surrogates.fitting import calibrate, recalibrate
 
 
 @KERNELS
@@ -259,14 +259,14 @@ def test_bands_are_stretched_and_never_narrowed() -> None:
     sure = Hyperparameters(p.length_scales, p.signal_variance / 100, p.noise_variance / 100)
     raw = condition(sure, X, Y, **BOX)
     assert raw.band == 1.0
-    mended = calibrated(raw)
+    mended = calibrate(raw)
     unseen = design("lhs", **BOX, n=500, seed=4)
     mean, std = mended.predict(unseen, return_std=True)
     assert np.mean(np.abs(mean - smooth(unseen)[0]) <= 1.96 * std) > 0.85
     np.testing.assert_allclose(std, mended.band * raw.predict(unseen, return_std=True)[1])
     vague = Hyperparameters(p.length_scales, 1e4 * p.signal_variance, 1e4 * p.noise_variance)
-    assert calibrated(condition(vague, X, Y, **BOX)).band == 1.0
-    assert calibrated(condition(sure, X[:4], Y[:4], **BOX)).band == 1.0  # too few to tell
+    assert calibrate(condition(vague, X, Y, **BOX)).band == 1.0
+    assert calibrate(condition(sure, X[:4], Y[:4], **BOX)).band == 1.0  # too few to tell
 
 
 @pytest.mark.parametrize("kernel", ["rbf", "matern52"])
@@ -276,7 +276,7 @@ def test_fresh_points_lie_within_the_bands_nearly_as_promised(kernel: str) -> No
     for seed in range(8):
         X = design("lhs", **UNIT, n=12, seed=seed)
         fresh = design("sobol", **UNIT, n=128, seed=seed)
-        process = recalibrated(fit(X, kinked(X), **UNIT, kernel=kernel, noise=0.0, starts=2))
+        process = recalibrate(fit(X, kinked(X), **UNIT, kernel=kernel, noise=0.0, starts=2))
         mean, std = process.predict(fresh, return_std=True)
         z = np.abs(mean - kinked(fresh)) / std
         shares.append([[np.mean(z * b <= k) for k in (1, 2, 3)] for b in (1.0, process.band)])

@@ -14,7 +14,7 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.choice import _squared, choose_inputs
+from ccd_casadi.synthesis.choice import _squared_gamma, choose_inputs
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
 
@@ -61,11 +61,11 @@ def test_a_synthesis_bounds_all_presences(seed: int) -> None:
     """γ_opt² lies above its tangents, and these are those of differences."""
     plant, rng = plate(seed), np.random.default_rng(seed)
     at, other = rng.dirichlet(np.ones(INPUTS), 2) * 3.0 + 0.01
-    value, slope = _squared(plant, WEIGHTS, at)
-    there = _squared(plant, WEIGHTS, other)[0]
+    value, slope = _squared_gamma(plant, WEIGHTS, at)
+    there = _squared_gamma(plant, WEIGHTS, other)[0]
     assert there >= value + slope @ (other - at) - 1e-6 * value
     step = 1e-4 * rng.normal(size=INPUTS) * at
-    ends = [_squared(plant, WEIGHTS, at + sign * step)[0] for sign in (1.0, -1.0)]
+    ends = [_squared_gamma(plant, WEIGHTS, at + sign * step)[0] for sign in (1.0, -1.0)]
     assert (ends[0] - ends[1]) / 2.0 == pytest.approx(slope @ step, rel=1e-4, abs=1e-8 * value)
 
 

@@ -118,7 +118,7 @@ def test_it_is_a_constraint_of_the_outer_problem() -> None:
     assert np.abs(here.jacobian[row]).max() > 0.0
 
 
-def test_it_is_part_of_what_a_sample_is_only_where_it_is_asked() -> None:
+def test_it_is_part_of_what_a_sample_is_only_where_it_is_required() -> None:
     case = problem()
     assert bounded(1e-5).identity() == bounded(2e-5).identity() != case.identity()
     assert bounded(1e-5).inner_identity() != bounded(2e-5).inner_identity()

@@ -100,7 +100,7 @@ def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: in
     """X̂ = X(I - YX/γ²)⁻¹ with X of the four-block problem; ρ(XY) < γ² above γ_opt only."""
     plant, weights = drawn(seed, p)
     A, B, C = plant.A, plant.B, plant.C
-    w, delta = weights.scaled(plant.omega_0), weights.delta
+    w, delta = weights.scale(plant.omega_0), weights.delta
     Y, ok = filter_solution(A, B, C, delta)
     assert ok
     residual = A @ Y + Y @ A.T + delta**2 * B @ B.T - Y @ C.T @ C @ Y

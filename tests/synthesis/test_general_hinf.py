@@ -180,7 +180,7 @@ def test_what_others_reported_is_solved_or_refused_by_name(source: str) -> None:
         K = StateSpace(found.K.A, found.K.B, found.K.C, found.K.D)
         loop = close(hard.plant, K)
         assert np.linalg.eigvals(loop.A).real.max() < 0.0
-        assert sigma_max(loop.swept(grid)).max() <= found.gamma * (1.0 + 1e-6)
+        assert sigma_max(loop.sweep(grid)).max() <= found.gamma * (1.0 + 1e-6)
         break
     else:
         pytest.fail("no size of noise was enough")

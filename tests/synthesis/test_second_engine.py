@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles.helpers import HZ, problem
 
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.synthesis import second_engine
@@ -47,7 +47,7 @@ def test_a_sampled_loop_has_the_norm_of_the_bilinear_one(delay_us: float) -> Non
     plant = scaled_plant(problem(), THETA).plant_si()
     found = second_opinion(plant, design.controller, sampling)
     T = sampling.period
-    loop = closed_loop(sampled(plant, T, sampling.delay), tustin(design.controller, T))
+    loop = closed_loop(zoh(plant, T, sampling.delay), tustin(design.controller, T))
     assert found.stable == (np.abs(loop.S.poles).max() < 1.0)
     if found.stable:
         assert found.norms["S"] == pytest.approx(hinf_norm(loop.S)[0], rel=AGREEMENT)
@@ -70,7 +70,7 @@ def test_the_weighted_loop_is_that_of_the_weights(disturbance: float) -> None:
         np.testing.assert_allclose(found[:, :2, 1].T, of_force, rtol=1e-8, atol=1e-11)
 
 
-def test_a_false_claim_an_unstable_loop_and_no_answer_are_told_apart(
+def test_a_false_claim_an_unstable_loop_and_no_answer_are_reported_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     design, plant = made(), scaled_plant(problem(), THETA).plant_si()

@@ -127,7 +127,7 @@ def test_nothing_jumps_where_a_pole_crosses_the_axis(seed: int, p: int) -> None:
 @given(seeds, sizes, sizes)
 def test_the_states_that_are_left_out_are_not_seen(seed: int, p: int, unstable: int) -> None:
     plant, weights = drawn(seed, p, unstable)
-    A, B, C, w = plant.A, plant.B, plant.C, weights.scaled(plant.omega_0)
+    A, B, C, w = plant.A, plant.B, plant.C, weights.scale(plant.omega_0)
     found = unstable_modes(A, C)
     assert found is not None
     residual = A @ found.Y + found.Y @ A.T - found.Y @ C.T @ C @ found.Y
@@ -147,7 +147,7 @@ def test_the_states_that_are_left_out_are_not_seen(seed: int, p: int, unstable: 
 def test_an_unstable_block_is_not_separated() -> None:
     """The observer of an unstable block corrects plant states: the plant is solved whole."""
     (one, weights), (two, _) = drawn(2, 1, 1), drawn(3, 1, 1)
-    w = weights.scaled(one.omega_0)
+    w = weights.scale(one.omega_0)
     A, B, C = (block_diag(*parts) for parts in ((one.A, two.A), (one.B, two.B), (one.C, two.C)))
     grid = np.geomspace(1e-3, 1e3, 300)
     gain, n, eye = plant_gain(A, B, C, grid), len(one.A), np.eye(2)

@@ -25,7 +25,7 @@ def test_x_is_positive_above_the_optimum_in_every_direction_and_not_below(seed: 
     """At 145 and 241 a second direction of X turns infinite 1.6e-3 and 7e-4 below the first: a
     search that follows one direction alone ends there."""
     plant, design = made(seed)
-    w = design.weights.scaled(plant.omega_0)
+    w = design.weights.scale(plant.omega_0)
     modes = unstable_modes(plant.A, plant.C)
     given = plant.A, plant.B, plant.C, w
     gp = unstable_plant(*given, modes) if modes else generalized_plant(*given)

@@ -20,9 +20,9 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.surface import surface_figure
 from ccd_casadi.drawing.svg import ModeShapes
 from ccd_casadi.extensions.cad import solid
-from ccd_casadi.extensions.cad.elastic_body import Body, mode_shapes, reduced, surface
+from ccd_casadi.extensions.cad.elastic_body import Body, mode_shapes, reduce_body, surface
 from ccd_casadi.extensions.cad.solid import volumes
-from ccd_casadi.plants.differenced import remembered
+from ccd_casadi.plants.differenced import remember
 from ccd_casadi.plants.finite_elements import Material
 from ccd_casadi.plants.fixed_parameters import with_fixed
 from ccd_casadi.plants.plant import Mechanics, Plant, named_values
@@ -123,7 +123,7 @@ def draw_morph(
         part, named = drawn(0.5 * (lower + upper))
         solid.load(gmsh, part)
         tags = {name: solid.face_at(gmsh, name, point) for name, point in named.items()}
-        mesh = solid.meshed(gmsh, size)
+        mesh = solid.mesh_solid(gmsh, size)
         bar.advance()
         samples = []
         for row in theta:
@@ -154,7 +154,7 @@ def draw_morph(
 
 
 def write_morph(morph: Morph, file: str | Path) -> None:
-    """As an .npz file without pickled objects."""
+    """Write a morph as an .npz file without pickled objects."""
     faces = {f"face:{name}": triangles for name, triangles in morph.faces.items()}
     fields = {key: value for key, value in vars(morph).items() if key != "faces"}
     with Path(file).open("wb") as stream:
@@ -281,7 +281,7 @@ class CadStage:
         for k, (face, axis) in enumerate(ports):
             block = slice(axis * nodes, (axis + 1) * nodes)
             F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
-        found = reduced(body, velocities, F, dF, self.modes, self._held(body))
+        found = reduce_body(body, velocities, F, dF, self.modes, self._held(body))
         count = found.M.shape[0] - self.modes
         rows = [MOTIONS.index(name) for name in self.rigid] if count else []
         rows += range(count, count + self.modes)
@@ -319,13 +319,13 @@ class CadStage:
         return surface_figure(surfaces, faces, [self.mass(theta) for theta in thetas.values()])
 
     def mass(self, theta: Sequence[float] | Array) -> float:
-        """In kg."""
+        """Compute the mass in kg."""
         return float(
             self.material.density * volumes(self.morph.points(theta), self.morph.tets).sum()
         )
 
     def mass_slope(self, theta: Sequence[float] | Array) -> Array:
-        """∂mass/∂θ, (p,)."""
+        """Compute ∂mass/∂θ, (p,)."""
         corners = self.morph.points(theta)[self.morph.tets]
         moved = self.morph.velocities(theta)[:, self.morph.tets]
         edges, steps = (part[..., 1:, :] - part[..., :1, :] for part in (corners, moved))
@@ -354,13 +354,13 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
     plant = Plant(
         names=morph.names,
         constraint_names=(),
-        evaluate=remembered(stage.mechanics),
+        evaluate=remember(stage.mechanics),
         hardware=ca.Function("hardware", [theta], [mass((theta - middle) / half), ca.MX(0, 1)]),
         outputs=len(stage.sensors),
         inputs=len(stage.forces),
-        references={"twice as many modes": remembered(finer.mechanics, False)},
+        references={"twice as many modes": remember(finer.mechanics, False)},
         exact_hessian=False,
-        values=remembered(stage.mechanics, False),
+        values=remember(stage.mechanics, False),
         notes=lambda theta: notes,
         domain=(morph.lower, morph.upper),
         shapes=stage.shapes,

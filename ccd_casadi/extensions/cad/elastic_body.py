@@ -37,7 +37,7 @@ class Body:
 
     @cached_property
     def _bases(self) -> tuple[Any, Any]:
-        """Of K and of M."""
+        """The finite-element bases of K and of M."""
         fem = require("skfem", "cad")
         element = fem.ElementTetP2()
         exact = (2, 4)  # orders of quadrature
@@ -46,15 +46,15 @@ class Body:
     @property
     def places(self) -> Array:
         """(N, 3) where the N second-order nodes are."""
-        return self.carried(self.points)
+        return self.carry(self.points)
 
-    def carried(self, values: Array) -> Array:
+    def carry(self, values: Array) -> Array:
         """(N, 3) at all nodes of values linear on the elements, (n, 3) at their corners."""
         return np.vstack([values, values[self._mesh.edges].mean(axis=0)])
 
     def matrices(self) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
         """K (3N, 3N) in N/m and M (3N, 3N) in kg."""
-        return self._assembled(lambda u, v, w: u.grad[w.i] * v.grad[w.j], lambda u, v, w: u * v)
+        return self._assemble(lambda u, v, w: u.grad[w.i] * v.grad[w.j], lambda u, v, w: u * v)
 
     def slopes(self, velocity: Array) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
         """K' and M' where the points move with `velocity` (n, 3)."""
@@ -71,7 +71,7 @@ class Body:
             dV = w.velocity.grad
             return (dV[0, 0] + dV[1, 1] + dV[2, 2]) * u * v
 
-        return self._assembled(product, inertia, velocity)
+        return self._assemble(product, inertia, velocity)
 
     def on(self, triangles: np.ndarray) -> np.ndarray:
         """(m,) numbers of the nodes on element faces (f, 3)."""
@@ -115,10 +115,11 @@ class Body:
         linear = basis.with_element(fem.ElementVector(fem.ElementTetP1()))
         return linear.interpolate(velocity.ravel())
 
-    def _assembled(
+    def _assemble(
         self, product: Any, inertia: Any, velocity: Array | None = None
     ) -> tuple[sparse.csc_matrix, ...]:
-        """Of P_ij = ∫ ∂_i u ∂_j v: block (j, i) is λ P_ij + μ (P_ij ᵀ + δ_ij Σ_k P_kk)."""
+        """Assemble K and M from P_ij = ∫ ∂_i u ∂_j v: block (j, i) is λ P_ij + μ (P_ij ᵀ + δ_ij Σ_k
+        P_kk)."""
         fem = require("skfem", "cad")
         (first, shear), (stiff, inert) = self.material.lame, self._bases
         of_stiff, of_inert = (
@@ -158,7 +159,7 @@ class Reduced:
     dF: Array
 
 
-def reduced(
+def reduce_body(
     body: Body, velocities: Array, F: Array, dF: Array, count: int, held: np.ndarray
 ) -> Reduced:
     """The `count` lowest flexible modes; `velocities` (p, n, 3) of the points, F (3N, r), dF.
@@ -167,7 +168,7 @@ def reduced(
     """
     free = np.flatnonzero(~held)
     F, dF = F[free], dF[:, free]
-    pencil, M, R, rigid, values, vectors = _solved(body, count, held)
+    pencil, M, R, rigid, values, vectors = _solve(body, count, held)
     lam, kept, more = values[:count], vectors[:, :count], vectors[:, count:]
     first = R.shape[1]
     size, flexible = first + count, slice(first, None)
@@ -195,7 +196,7 @@ def reduced(
         for i, Z in enumerate(beside):
             out.dF[t, first + i] -= (K_kept[:, i] - lam[i] * M_kept[:, i]) @ Z
         if first:
-            steps = body.carried(velocity) - _centre_slope(M, dM, body.places, velocity, body)
+            steps = body.carry(velocity) - _centre_slope(M, dM, body.places, velocity, body)
             dR = _motions(steps, False)
             moved = dR.T @ (M @ R)
             out.dM[t, :first, :first] = moved + moved.T + R.T @ (dM @ R)
@@ -204,8 +205,8 @@ def reduced(
 
 
 def mode_shapes(body: Body, count: int, held: np.ndarray) -> ModeShapes:
-    """The `count` lowest flexible modes on the body's surface; `held` as in `reduced`."""
-    values, vectors = _solved(body, count, held)[-2:]
+    """The `count` lowest flexible modes on the body's surface; `held` as in `reduce_body`."""
+    values, vectors = _solve(body, count, held)[-2:]
     used, faces = surface(body.tets)
     modes = []
     for i in range(count):
@@ -223,7 +224,7 @@ def surface(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return used, outer.reshape(-1, 3)[:, [0, 1, 2, 2]]
 
 
-def _solved(
+def _solve(
     body: Body, count: int, held: np.ndarray, *, extra: int = 2, shift: float = 1e-3
 ) -> tuple[Pencil, sparse.csc_matrix, Array, Array, Array, Array]:
     """The pencil and M of what is free, rigid motions as they are and orthonormal, λ and modes.
@@ -263,7 +264,7 @@ def _centre(M: Array, places: Array) -> Array:
 
 def _centre_slope(M: Array, dM: Array, places: Array, velocity: Array, body: Body) -> Array:
     weight, change = _weights(M, places), _weights(dM, places)
-    moment = change @ places + weight @ body.carried(velocity)
+    moment = change @ places + weight @ body.carry(velocity)
     return (moment - change.sum() * _centre(M, places)) / weight.sum()
 
 

@@ -38,7 +38,7 @@ class Boundary:
 
 
 def boundary_of(gmsh: Any) -> Boundary:
-    """That of the solid which gmsh has loaded."""
+    """Read the boundary of the solid that gmsh has loaded."""
     model = gmsh.model
 
     def pieces(dimension: int, points: Callable[[int], Array]) -> dict[int, Piece]:
@@ -62,7 +62,7 @@ def edge_points(gmsh: Any, tag: int, shares: Array) -> Array:
     return np.reshape(gmsh.model.getValue(1, tag, low + shares * (high - low)), (-1, 3))
 
 
-def matched(old: Boundary, new: Boundary) -> tuple[dict[int, int], dict[int, int], dict[int, int]]:
+def match(old: Boundary, new: Boundary) -> tuple[dict[int, int], dict[int, int], dict[int, int]]:
     """The number in `new` of each corner, edge and face of `old`, less than 0 of an edge that runs
     the other way, as gmsh has it. Raises PlantError where they do not agree."""
     for word in ("corners", "edges", "faces"):
@@ -106,7 +106,7 @@ def _pieces(
 
 
 def _distances(one: Piece, other: Piece) -> tuple[float, float]:
-    """How far the points are from each other, and from those in the other order."""
+    """Compute how far the points are from each other, and from those in the other order."""
     gaps = (one.points - points for points in (other.points, other.points[::-1]))
     straight, back = (float(np.linalg.norm(gap)) for gap in gaps)
     return straight, back
@@ -175,7 +175,7 @@ def load(gmsh: Any, drawn: Any) -> None:
         raise PlantError(f"the drawing has {solids} solids; fuse its parts into one")
 
 
-def meshed(gmsh: Any, size: float, *, per_turn: int = 20) -> SolidMesh:
+def mesh_solid(gmsh: Any, size: float, *, per_turn: int = 20) -> SolidMesh:
     """Mesh the solid that is loaded: edges of at most `size` in m, `per_turn` around a circle."""
     gmsh.option.setNumber("Mesh.MeshSizeMax", size)
     gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", per_turn)
@@ -213,7 +213,7 @@ def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
 
     Raises PlantError where its boundary has other pieces, or where an element turns inside out.
     """
-    corners, edges, faces = matched(mesh.boundary, boundary_of(gmsh))
+    corners, edges, faces = match(mesh.boundary, boundary_of(gmsh))
     old, new = mesh.points, mesh.points.copy()
     for tag, node in mesh.corners.items():
         new[node] = gmsh.model.getValue(0, corners[tag], [])
@@ -226,12 +226,12 @@ def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
         rim = np.intersect1d(triangles, placed)
         inner = np.setdiff1d(triangles, rim)
         if inner.size:
-            step = extended(old, triangles, rim, new[rim] - old[rim])[inner]
+            step = extend(old, triangles, rim, new[rim] - old[rim])[inner]
             near, _ = gmsh.model.getClosestPoint(2, faces[tag], (old[inner] + step).ravel())
             new[inner] = near.reshape(-1, 3)
             surface.append(inner)
     boundary = np.concatenate(surface)
-    new = old + extended(old, mesh.tets, boundary, new[boundary] - old[boundary])
+    new = old + extend(old, mesh.tets, boundary, new[boundary] - old[boundary])
     if volumes(new, mesh.tets).min() <= 0.0:
         raise PlantError(
             "an element of the moved mesh is inside out; narrow the bounds, or give a finer mesh"
@@ -279,7 +279,7 @@ def laplacian(points: Array, simplices: np.ndarray) -> sparse.csc_matrix:
     return sparse.coo_matrix((local.ravel(), (rows, columns)), shape=(size, size)).tocsc()
 
 
-def extended(points: Array, simplices: np.ndarray, known: np.ndarray, values: Array) -> Array:
+def extend(points: Array, simplices: np.ndarray, known: np.ndarray, values: Array) -> Array:
     """Values (n, d), those at the nodes `known` as given (k, d), harmonic at the mesh's others.
 
     Nodes that the mesh does not touch are zero. A linear function of space is its own extension.

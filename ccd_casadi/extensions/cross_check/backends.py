@@ -26,7 +26,7 @@ import slycot
 from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati_synthesis import four_block_plant
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import Overrun, Runner
@@ -76,7 +76,7 @@ def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
     W_T u]: from d to u is T at the input.
     """
     p, m = len(plant.C), plant.B.shape[1]
-    given = (plant.A, plant.B, plant.C, weights.scaled(plant.omega_0))
+    given = (plant.A, plant.B, plant.C, weights.scale(plant.omega_0))
     if weights.delta:
         A, B1, B2, C1, C2, D11, D12 = four_block_plant(*given, weights.delta)
         return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p, p + m), np.zeros((p, m)))
@@ -89,7 +89,7 @@ def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
 def balance(plant: StandardPlant) -> StandardPlant:
     """The same plant in balanced coordinates of its state."""
     whole = plant.whole()
-    A, B, C = balanced(whole.A, whole.B, whole.C)
+    A, B, C = balance_system(whole.A, whole.B, whole.C)
     w, z = plant.D11.shape[1], len(plant.D11)
     return replace(plant, A=A, B1=B[:, :w], B2=B[:, w:], C1=C[:z], C2=C[z:])
 
@@ -200,7 +200,7 @@ def synthesise_with(
     task = (SOLVERS[backend], mixed_sensitivity(plant.design_plant, weights), gamma_backoff)
     slack = 1.0 + CertifiedDesignOptions.freed if plant.family else 1.0
     try:
-        attempt, seconds = _timed(*task) if runner is None else runner.call(limit, _timed, *task)
+        attempt, seconds = _time(*task) if runner is None else runner.call(limit, _time, *task)
     except Overrun as error:
         attempt, seconds = Attempt(np.nan, np.nan, None, str(error)), time.perf_counter() - began
     K = attempt.controller
@@ -215,7 +215,7 @@ def synthesise_with(
     return BackendResult(backend, attempt.gamma_opt, design, figures.outcome.value, seconds)
 
 
-def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[Attempt, float]:
+def _time(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[Attempt, float]:
     """The attempt and the seconds that it took."""
     began = time.perf_counter()
     attempt = solve(plant, gamma_backoff=gamma_backoff)

@@ -54,7 +54,7 @@ class Polynomials(NamedTuple):
 
 @dataclass(frozen=True)
 class Cascade:
-    """Which of a drive's blocks are used, and on which sensors.
+    """The blocks of a drive that are used, and the sensors they read.
 
     Attributes
     ----------
@@ -113,10 +113,10 @@ class Cascade:
 
     @cached_property
     def hertz(self) -> np.ndarray:
-        """Which settings are frequencies of filters."""
+        """Whether each setting is the frequency of a filter."""
         return np.array([setting.unit == "Hz" for setting in self.settings])
 
-    def allowed(self, values: Values) -> Array:
+    def allowed_bandwidths(self, values: Values) -> Array:
         """The ω_b that Kv, Tn and each filter's frequency allow.
 
         Filters an octave or more above ω_b shape resonances; beside it they take the place of the
@@ -153,7 +153,7 @@ class Cascade:
         slopes[1, 0] = slopes[:, 1] = 1.0
         slopes[:, 2] = -lag / (1.0 + lag)
         ahead = np.ones(len(z), complex)
-        for place, at, F, steep in self._filtered(values, z):
+        for place, at, F, steep in self._filter_responses(values, z):
             slopes[1, at] = steep
             if place == "current":
                 base = base * F
@@ -168,10 +168,11 @@ class Cascade:
             dK[:, sensor] += path * steep
         return K, dK
 
-    def _filtered(
+    def _filter_responses(
         self, values: Values, z: np.ndarray
     ) -> Iterator[tuple[str, slice, np.ndarray, np.ndarray]]:
-        """Of every filter its place, where its values are, F (k,) and ∂ln F/∂ln values (n, k)."""
+        """Yield of every filter its place, where its values are, F (k,) and ∂ln F/∂ln values (n,
+        k)."""
         at = 3
         for slot, block, own in zip(self.slots, self.filters, self.parts(values), strict=True):
             F, steep = block.response(own, z)
@@ -182,7 +183,7 @@ class Cascade:
         """ln of the gain of all filters behind the motor's sensor and behind the position's (2, k),
         and its slopes to ln values (n, 2, k)."""
         found, slopes = np.zeros((2, len(z))), np.zeros((len(self.settings), 2, len(z)))
-        for place, at, F, steep in self._filtered(values, z):
+        for place, at, F, steep in self._filter_responses(values, z):
             ways = slice(0, 2) if place == "current" else slice(1, 2)
             found[ways] += np.log(np.abs(F))
             slopes[at, ways] += steep.real[:, None]
@@ -249,7 +250,7 @@ def _second_order(b: Array, a: Array, T: float) -> StateSpace:
 
 @dataclass(frozen=True)
 class ArithmeticOptions:
-    """What the drive's file does not say."""
+    """Numbers of the arithmetic that the drive's file does not state."""
 
     grain: float = 2.0**-20  # N, of an integer of a fixed-point filter's signal
     bits: int = 30  # of its coefficients' fraction
@@ -277,10 +278,10 @@ class Program:
 
     def run(self, reference: Array, position: Array, motor: Array) -> list[Any]:
         """Force at every instant, of the reference and both sensors in m as the drive has them."""
-        step = self.started()
+        step = self.start()
         return [step(*row) for row in zip(reference, position, motor, strict=True)]
 
-    def started(self) -> Callable[[float, float, float], Any]:
+    def start(self) -> Callable[[float, float, float], Any]:
         """The program at rest: the force of (r, y, m), call after call."""
         real = self.real
         states = {id(own): [0, 0, 0, 0] if self._fixed else [real(0)] * 4
@@ -297,13 +298,13 @@ class Program:
             fast = (r - before) * real(self.rate)
             v = held + real(self.ahead) * fast
             for own in self.setpoint:
-                v = self._filtered(own, states[id(own)], v)
+                v = self._filter(own, states[id(own)], v)
             w = v - (m - last) * real(self.rate)
             total = total + real(self.share) * w
             u = real(self.Kp) * (w + total) + real(self.push) * (fast - speed)
             last, before, speed = m, r, fast
             for own in self.current:
-                u = self._filtered(own, states[id(own)], u)
+                u = self._filter(own, states[id(own)], u)
             return u
 
         return step
@@ -312,7 +313,7 @@ class Program:
     def _fixed(self) -> bool:
         return self.kind is Number.FIXED_30
 
-    def _filtered(self, own: tuple[Any, ...], state: list[Any], u: Any) -> Any:
+    def _filter(self, own: tuple[Any, ...], state: list[Any], u: Any) -> Any:
         """y_k of u_k; `state`: u and y of the two instants before."""
         b0, b1, b2, a1, a2 = own
         grain = self.options.grain
@@ -362,12 +363,12 @@ def program_of(
 
 
 def following_error(program: Program, plant: StateSpace, position: int, velocity: int) -> float:
-    """How far in m the position is behind its setpoint at most, in a simulated move.
+    """Compute the largest lag in m of the position behind its setpoint, in a simulated move.
 
     The setpoint is the polynomial of seventh order from rest to rest; sensors are exact. `plant`:
     from force to all sensors at the program's rate; `position`, `velocity`: their numbers.
     """
-    o, step, x, worst = program.options, program.started(), np.zeros(len(plant.A)), 0.0
+    o, step, x, worst = program.options, program.start(), np.zeros(len(plant.A)), 0.0
     for k in range(round((o.seconds + o.rest) * program.rate)):
         t = min(k / program.rate / o.seconds, 1.0)
         r = o.distance * t**4 * (35.0 - 84.0 * t + 70.0 * t**2 - 20.0 * t**3)

@@ -5,7 +5,8 @@ force d moves what counts, z, by
 
     z/d = G_zd - G_zu Σ_j K_j G_jd/(1 + L) = (G_zd (1 + L) - Σ_j K_j G_zu G_jd)/(1 + L)
 
-with hold and delay in G_zu alone, as `lti.loop.Loop.moved` has it: one more row, where bounded.
+with hold and delay in G_zu alone, as `lti.loop.Loop.force_responses` has it: one more row, where
+bounded.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.extensions.drives.drive_data import Filter, Number
 from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 
@@ -150,7 +151,7 @@ class CascadeRows:
         self.cascade, self.bounds, self.options = cascade, bounds, options
         T = sampling.period
         self.sampling, self.plants = sampling, [split(plant, cascade) for plant in plants]
-        self.systems = [sampled(plant, T, sampling.delay) for plant, *_ in self.plants]
+        self.systems = [zoh(plant, T, sampling.delay) for plant, *_ in self.plants]
         rates = np.concatenate([np.abs(plant.rates) for plant in plants])
         near = rates[(rates > bounds.omega_low) & (rates < np.pi / T)]
         about = (near[:, None] * np.linspace(0.9, 1.1, 21)).ravel()
@@ -179,15 +180,15 @@ class CascadeRows:
         """Every plant at these frequencies."""
         found = []
         for system, (plant, drive, counted) in zip(self.systems, self.plants, strict=True):
-            G = system.swept(omega)[:, :, 0].T
+            G = system.sweep(omega)[:, :, 0].T
             most = self.bounds.compliance_max
             if most is None:
                 found.append(SensorResponses(G))
                 continue
             C = np.vstack([plant.C, counted])
-            d = strictly_proper(plant.A, drive, C).swept(omega)[:, :, 0].T
+            d = strictly_proper(plant.A, drive, C).sweep(omega)[:, :, 0].T
             late = strictly_proper(plant.A, plant.B, counted)
-            u = sampled(late, self.period, self.sampling.delay).swept(omega)[:, 0, 0]
+            u = zoh(late, self.period, self.sampling.delay).sweep(omega)[:, 0, 0]
             limit = np.where(omega <= self.cascade.stiff_below, most, np.inf)
             found.append(SensorResponses(G, (d[-1], u * d[:-1], limit)))
         return found
@@ -251,8 +252,8 @@ class CascadeRows:
         return c[good], np.concatenate(slopes)[good]
 
     def _filter_rows(self, kappa: Array, log_band: float) -> list[tuple[Array, Array]]:
-        """What filters, Kv and Tn may not do: raise their gain beyond `filter_gain`, or allow less
-        than ω_b (`Cascade.allowed`)."""
+        """List the rows that forbid filters, Kv and Tn to raise their gain beyond `filter_gain`, or
+        to allow less than ω_b (`Cascade.allowed_bandwidths`)."""
         found, n = [], len(kappa)
         if np.isfinite(self.cascade.filter_gain):
             rise, steep = self.cascade.rises(np.exp(kappa), self.z)
@@ -263,7 +264,7 @@ class CascadeRows:
         slope = np.zeros((len(places), n + 1))
         slope[np.arange(len(places)), places], slope[:, -1] = -1.0, 1.0
         slope[1, 2] = 1.0  # of Tn
-        return [*found, (log_band - np.log(self.cascade.allowed(np.exp(kappa))), slope)]
+        return [*found, (log_band - np.log(self.cascade.allowed_bandwidths(np.exp(kappa))), slope)]
 
     def _coefficients(self, kappa: Array) -> list[tuple[Array, Array]]:
         """ln of the largest coefficient of each filter over what fixed point holds, by central
@@ -317,11 +318,11 @@ class CascadeRows:
         self.on(np.union1d(coarse, new))
         return True
 
-    def judged(self, values: Array) -> tuple[float, float]:
+    def judge(self, values: Array) -> tuple[float, float]:
         """ω_b by the shape, Kv, Tn and the filters, and the largest ln of a peak over its
         bound, on the grid."""
         K, b = self.cascade.responses(values, self.z)[0], self.bounds
-        bandwidth = float(self.cascade.allowed(values).min())
+        bandwidth = float(self.cascade.allowed_bandwidths(values).min())
         rise = self.cascade.rises(values, self.z)[0].max()
         worst = float(rise - np.log(self.cascade.filter_gain))
         for one in self.seen:

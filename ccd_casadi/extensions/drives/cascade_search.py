@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 from ccd_casadi.extensions.drives.cascade_rows import CascadeRows
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ
 
 
@@ -112,7 +112,7 @@ class Search(CascadeRows):
             worst = np.argsort(-over)[: o.rows]
             used[worst[over[worst] > o.violated]] = True
 
-    def fastest(self, seed: int = 0, progress: Tell = silent) -> Candidate | None:
+    def fastest(self, seed: int = 0, progress: Log = silent) -> Candidate | None:
         """The best of several starts; None where no start is stable or none meets the bounds."""
         o, rng = self.options, np.random.default_rng(seed)
         starts = [values for _ in range(o.starts) if (values := self.start(rng)) is not None]
@@ -126,22 +126,22 @@ class Search(CascadeRows):
             left = climbed
             left.sort(key=lambda one: max(one.excess, 0.0) * o.penalty - np.log(one.bandwidth))
             left, others = left[: (n := max(1, round(share * len(starts))))], left[n:]
-        found = [self.settled(one) for one in left]
+        found = [self.settle(one) for one in left]
         for one in others:  # where none of the best meets the bounds between the grid's points
             if any(made.excess < o.met for made in found):
                 break
-            found.append(self.settled(one))
+            found.append(self.settle(one))
         good = [one for one in found if one.excess < o.met]
         return max(good, key=lambda one: one.bandwidth, default=None)
 
-    def settled(self, candidate: Candidate, fixed: np.ndarray | None = None) -> Candidate:
+    def settle(self, candidate: Candidate, fixed: np.ndarray | None = None) -> Candidate:
         """Steps from a candidate on, with the peaks that lie between the grid's points added."""
         found = candidate
         for _ in range(self.options.refinements):
             found = self.climb(found.values, fixed, bandwidth=found.bandwidth)
             if not self.refine(found.values):
                 break
-        bandwidth, excess = self.judged(found.values)
+        bandwidth, excess = self.judge(found.values)
         return Candidate(found.values, bandwidth, excess)
 
 
@@ -180,7 +180,7 @@ def on_the_grid(
             break
         best = min(found, key=lambda one: _merit(search, one))
         values, band = best.values.copy(), best.bandwidth
-    values = np.array([own.rounded(value) for own, value in zip(settings, values, strict=True)])
+    values = np.array([own.round_value(value) for own, value in zip(settings, values, strict=True)])
     return _by_steps(search, values, options)
 
 
@@ -188,7 +188,7 @@ def _by_steps(search: Search, values: Array, options: RoundingOptions) -> Candid
     """Single steps of single values, each kept if it helps and keeps the loops stable."""
 
     def of(values: Array) -> Candidate:
-        return Candidate(values, *search.judged(values))
+        return Candidate(values, *search.judge(values))
 
     here = of(values)
     for _ in range(options.passes):
@@ -196,7 +196,7 @@ def _by_steps(search: Search, values: Array, options: RoundingOptions) -> Candid
         for i, own in enumerate(search.cascade.settings):
             for by in options.hops:
                 there = here.values.copy()
-                there[i] = own.rounded(there[i], by)
+                there[i] = own.round_value(there[i], by)
                 if search.inside(there) and there[i] != here.values[i]:
                     found = of(there)
                     if _merit(search, found) < _merit(search, here) and search.stable(there):

@@ -42,7 +42,7 @@ from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, number
 
 
@@ -132,7 +132,7 @@ def _with_current_loop(
     if gain is None or time is None:
         raise UserError(f"{drive.title} has no parameters of a current controller; drop coil")
     sigma = 1.5 / rate
-    Kp, Tn = gain.rounded(L / (2.0 * sigma)), time.rounded(L / R)
+    Kp, Tn = gain.round_value(L / (2.0 * sigma)), time.round_value(L / R)
     if not Kp > 0.0 or abs(Tn * R / L - 1.0) > 0.05:
         words = f"coil needs Kp {L / (2.0 * sigma):g} V/A and Tn {L / R:g} s"
         raise UserError(f"{words}, which the drive has not; correct it, or give [actuator] instead")
@@ -215,7 +215,7 @@ class DriveAt:
 
 
 def codesign_drive(
-    drive: DriveProblem, seed: int = 0, progress: Tell = silent,
+    drive: DriveProblem, seed: int = 0, progress: Log = silent,
     options: DriveCodesignOptions = DriveCodesignOptions(),
 ) -> tuple[DriveAt, DriveAt]:  # fmt: skip
     """Find the best θ for a drive's cascade, from the case's start, which has to have one.
@@ -225,7 +225,7 @@ def codesign_drive(
     """
     problem = drive.problem
     require_bandwidth(problem, "ccd drive --codesign")
-    first = _designed(drive, problem.start, None, seed, options)
+    first = _design(drive, problem.start, None, seed, options)
     if first is None:
         raise UserError(NO_CASCADE)
     best = first
@@ -247,7 +247,7 @@ def codesign_drive(
         def objective(share: Array, theta_of=theta_of) -> float:  # type: ignore[no-untyped-def]
             nonlocal best, tried, allowed
             theta = theta_of(share)
-            found = _designed(drive, theta, best, seed, options)
+            found = _design(drive, theta, best, seed, options)
             tried += 1
             if (
                 found is not None
@@ -287,7 +287,7 @@ def meets_constraints(
     return bool((values <= options.met).all())
 
 
-def _designed(
+def _design(
     drive: DriveProblem, theta: tuple[float, ...], near: DriveAt | None, seed: int,
     options: DriveCodesignOptions,
 ) -> DriveAt | None:  # fmt: skip
@@ -306,7 +306,7 @@ def _designed(
         values = np.clip(values, *np.exp([search.low, search.high]))
         found = None
         if search.stable(values):
-            found = search.settled(replace(near.candidate, values=values))
+            found = search.settle(replace(near.candidate, values=values))
         if found is None or not found.excess < own.met:
             few = replace(own, starts=max(1, own.starts // 6))
             found = Search(drive.cascade, drive.bounds, drive.sampling, plants, few).fastest(seed)

@@ -28,7 +28,7 @@ Factor = tuple[str, ...]  # names of f and D, or of f alone
 
 
 class Rule(StrEnum):
-    """How a drive makes a difference equation of a filter."""
+    """The rule by which a drive makes a difference equation of a filter."""
 
     BILINEAR = "bilinear"
     PREWARPED = "prewarped"
@@ -111,7 +111,7 @@ class Filter:
         if self.rule is not Rule.BACKWARD:
             b, a = (np.convolve(p, np.poly(-np.ones(order - len(p)))) for p in (b, a))
         b, a = (np.pad(p, (0, 3 - len(p))) for p in (b, a))
-        return self._rounded(b / a[0]), self._rounded(a / a[0])
+        return self._round(b / a[0]), self._round(a / a[0])
 
     def _product(self, values: dict[str, float], factors: tuple[Factor, ...]) -> Array:
         found = np.ones(1)
@@ -127,7 +127,7 @@ class Filter:
             found = np.convolve(found, part)
         return np.asarray(found)
 
-    def _rounded(self, c: Array) -> Array:
+    def _round(self, c: Array) -> Array:
         if self.number is Number.SINGLE:
             return np.asarray(c.astype(np.float32), float)
         if self.number is Number.FIXED_30:
@@ -154,13 +154,13 @@ class Setting:
     per_si: float = 1.0  # its value per SI (1/s, N s/m, s, Hz)
     rotary: str = ""  # its unit where a rotary motor counts (N m s/rad, kg m²): `behind_screw`
 
-    def rounded(self, value: float, by: int = 0) -> float:
+    def round_value(self, value: float, by: int = 0) -> float:
         """The nearest grid value in SI, `by` steps beside it, within the limits."""
         at = round(value * self.per_si / self.step) + by
         first, last = -(-self.least // self.step), self.most // self.step
-        return self.shown(min(max(at, first), last)) / self.per_si
+        return self.format_steps(min(max(at, first), last)) / self.per_si
 
-    def shown(self, steps: float) -> float:
+    def format_steps(self, steps: float) -> float:
         """A number of steps in the drive's unit, as its decimals have it."""
         return float(f"{steps * self.step:.12g}")
 
@@ -182,7 +182,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a drive accepts."""
+    """The settings that a drive accepts."""
 
     title: str
     loop: str  # "cascade": P position over PI velocity
@@ -202,7 +202,7 @@ class Drive:
     travel: float | None = None  # of the axis by a turn of a rotary motor, m/rad
 
     def places(self, place: str) -> tuple[Slot, ...]:
-        """Its filters at a place."""
+        """Return its filters at a place."""
         return tuple(slot for slot in self.slots if slot.place == place)
 
     def behind_screw(self, travel: float) -> "Drive":

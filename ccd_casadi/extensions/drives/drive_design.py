@@ -23,14 +23,14 @@ from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate,
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
-from ccd_casadi.lti.frequency_grid import local_maxima, zoomed
+from ccd_casadi.lti.frequency_grid import local_maxima, zoom
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent
-from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.support.terminal import Log, silent
+from ccd_casadi.support.text import HZ, plural
 
 NO_CASCADE = (
     "no cascade of this drive meets the bounds from any start; raise S_max or S_low, or give it "
@@ -70,10 +70,11 @@ class DriveDesign:
 
     @property
     def feedforward(self) -> list[tuple[Setting, float]]:
-        """What the drive has of it, with values on its grid: all of the velocity, and the mass."""
+        """The settings of the drive's feedforward, with values on its grid: all of the velocity,
+        and the mass."""
         drive = self.cascade.drive
         both = (drive.speed_feedforward, 1.0), (drive.force_feedforward, self.mass)
-        return [(own, own.rounded(value)) for own, value in both if own and self.mass]
+        return [(own, own.round_value(value)) for own, value in both if own and self.mass]
 
     @property
     def ahead(self) -> tuple[float, float]:
@@ -90,7 +91,7 @@ class DriveDesign:
 
     @property
     def rise(self) -> float:
-        """What all filters on a sensor's way raise at most, relative to their gain at rest."""
+        """The largest gain of all filters on a sensor's way, relative to their gain at rest."""
         turn = np.linspace(0.0, np.pi, DriveOptions().rise_points)[1:]
         return float(np.exp(self.cascade.rises(self.values, np.exp(1j * turn))[0].max()))
 
@@ -102,7 +103,7 @@ class DriveDesign:
 
 def design_drive(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, *,
-    seed: int = 0, workers: Pool | None = None, progress: Tell = silent,
+    seed: int = 0, workers: Pool | None = None, progress: Log = silent,
     options: DriveOptions = DriveOptions(), near: Candidate | None = None,
     ported: UncertainPlant | None = None,
 ) -> DriveDesign:  # fmt: skip
@@ -120,12 +121,12 @@ def design_drive(
     points: list[tuple[int, Array]] = []
     new = first_points(uncertain)
     draws = options.draws if len(new) > 1 else 0
-    progress(f"searching {options.search.starts} starts on {counted(len(new), 'plant')}")
+    progress(f"searching {options.search.starts} starts on {plural(len(new), 'plant')}")
     free = near
     for number in range(1, options.rounds + 1):
         points = [*points, *new]
         search = Search(cascade, bounds, sampling, plants_at(wide, points), options.search)
-        free = search.fastest(seed, progress) if free is None else search.settled(free)
+        free = search.fastest(seed, progress) if free is None else search.settle(free)
         if free is None:
             raise UserError(NO_CASCADE)
         progress(f"{free.bandwidth / HZ:.4g} Hz; rounding, round {number} of {options.rounds}")
@@ -173,7 +174,7 @@ def design_drive(
 
 def _design_two_rates(
     cascade: Cascade, uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling, seed: int,
-    progress: Tell, options: DriveOptions, near: Candidate | None,
+    progress: Log, options: DriveOptions, near: Candidate | None,
 ) -> DriveDesign:  # fmt: skip
     """Search with the part of a held error that has its frequency, judge by lifting; where that
     exceeds a bound, again with bounds that are tighter by as much."""
@@ -185,7 +186,7 @@ def _design_two_rates(
     for number in range(1, options.rounds + 1):
         progress(f"searching {options.search.starts} starts, round {number} of {options.rounds}")
         search = Search(cascade, own, sampling, plants[: len(points)], options.search)
-        free = search.fastest(seed, progress) if near is None else search.settled(near)
+        free = search.fastest(seed, progress) if near is None else search.settle(near)
         if free is None:
             raise UserError(NO_CASCADE)
         rounded = on_the_grid(search, free, options.rounding)
@@ -239,13 +240,15 @@ def moved_by_forces(
             continue
 
         def gain(omega: Array, loop: Loop = loop) -> Array:
-            return np.asarray(np.abs(loop.moved(omega.ravel())).max((1, 2)).reshape(omega.shape))
+            return np.asarray(
+                np.abs(loop.force_responses(omega.ravel())).max((1, 2)).reshape(omega.shape)
+            )
 
         omega = np.append(loop.grid(), min(cascade.stiff_below, np.pi / sampling.period * 0.999))
         omega = omega[(omega >= lowest) & (omega <= cascade.stiff_below)]
         values = gain(omega)
         top = local_maxima(values)
-        tops = zoomed(gain, omega[top - 1], omega[top + 1])[1]
+        tops = zoom(gain, omega[top - 1], omega[top + 1])[1]
         found.append(float(np.append(tops, values).max()))
     return np.array(found)
 
@@ -262,7 +265,8 @@ def with_compliance(judged: SetCertificate, moved: Array, most: float) -> SetCer
 
 
 def excesses(judged: SetCertificate, bounds: Bounds, bandwidth: float) -> Array:
-    """By which share every plant exceeds its worst bound, or falls short of the bandwidth."""
+    """Compute the share by which every plant exceeds its worst bound, or falls short of the
+    bandwidth."""
     found = np.full(len(judged.plants), np.inf)
     for i, one in enumerate(judged.plants):
         if one.stable:

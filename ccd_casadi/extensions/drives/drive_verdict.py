@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.codesign.final_judgement import survived
+from ccd_casadi.codesign.final_judgement import judge_survival
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.structured_entries import box_findings
 from ccd_casadi.codesign.survival import Survival, loops_of
@@ -29,7 +29,7 @@ from ccd_casadi.extensions.drives.drive_design import DriveDesign
 from ccd_casadi.extensions.drives.two_rates import LiftedLoop, lift, place_name
 from ccd_casadi.fixed_structure.certificate import SetCertificate
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.lti.loop import Loop, sampled
+from ccd_casadi.lti.loop import Loop, zoh
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import classical_margins
@@ -43,7 +43,7 @@ def verdict_entry(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     """
     own, stable = design.cascade, all(one.stable for one in design.certificate.plants)
     figures: dict[str, Any] = {}
-    certified, ranges = _certified(problem, design), None
+    certified, ranges = _certify(problem, design), None
     if stable:
         figures = _margins(problem, design)
     if stable and own.slower == 1:
@@ -64,16 +64,16 @@ def verdict_entry(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     }
 
 
-def lifted(problem: DriveProblem, design: DriveDesign) -> list[LiftedLoop]:
+def lift_loops(problem: DriveProblem, design: DriveDesign) -> list[LiftedLoop]:
     """The loops on the model and on the corners of the set."""
     rate = problem.sampling.period, problem.sampling.delay
     plants = problem.uncertain.as_written(problem.uncertain.corners())
-    return [lift(design.cascade, design.values, sampled(plant, *rate)) for plant in plants]
+    return [lift(design.cascade, design.values, zoh(plant, *rate)) for plant in plants]
 
 
 def _margins(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     """The least of these plants at every place, and of all places."""
-    loops, rows = lifted(problem, design), list[dict[str, Any]]()
+    loops, rows = lift_loops(problem, design), list[dict[str, Any]]()
     for place in loops[0].places:
         each, peak = [], 0.0
         for loop in loops:
@@ -100,7 +100,7 @@ def _margins(problem: DriveProblem, design: DriveDesign) -> dict[str, Any]:
     return {"margins": rows, **{key: min(row[key] for row in rows) for key in least}}
 
 
-def _certified(problem: DriveProblem, design: DriveDesign) -> Check:
+def _certify(problem: DriveProblem, design: DriveDesign) -> Check:
     judged, own = design.certificate, design.cascade
     line = partial(Check, "certified", figures={"figures_over_bounds": judged.worst})
     if design.rise > own.filter_gain:
@@ -114,7 +114,7 @@ def _certified(problem: DriveProblem, design: DriveDesign) -> Check:
 
 
 def _worst_words(judged: SetCertificate) -> str:
-    """What the judge says of the bound that is exceeded most."""
+    """Describe the bound that is exceeded most, by the judge."""
     name, share = max(judged.worst.items(), key=lambda one: one[1], default=("", 0.0))
     return f"exceeds {name} by {100.0 * (share - 1.0):.2g} %" if share > 1.0 else judged.words
 
@@ -123,7 +123,7 @@ def _survival(problem: DriveProblem, design: DriveDesign) -> Survival | None:
     """The ranges of a certified loop off its model."""
     loops = loops_of(problem.problem, problem.theta, design.controller)
     # a drive's design has what is read of one of sections
-    return survived(problem.problem, loops, design)[0]  # type: ignore[arg-type]
+    return judge_survival(problem.problem, loops, design)[0]  # type: ignore[arg-type]
 
 
 def _survives(problem: DriveProblem, design: DriveDesign, ranges: Survival | None) -> Check:

@@ -66,7 +66,7 @@ class SampledModel:
 
     @cached_property
     def period(self) -> float:
-        """T in 1/unit."""
+        """The period T in 1/unit."""
         return self.sampling.period * self.unit
 
     @property
@@ -274,7 +274,7 @@ class CascadeFamily(LoopFamily):
 
 
 def _horner(row: Sequence[Affine | float], w: Affine) -> Affine:
-    """Σ row_k w^(n-k)."""
+    """Evaluate Σ row_k w^(n-k) by Horner's rule."""
     found = w * 0.0 + row[0]
     for part in row[1:]:
         found = found * w + part

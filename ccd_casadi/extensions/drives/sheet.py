@@ -11,11 +11,11 @@ from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.extensions.drives.cascade import ArithmeticOptions, following_error, program_of
 from ccd_casadi.extensions.drives.drive_case import DriveAt, DriveProblem
 from ccd_casadi.extensions.drives.drive_design import DriveDesign
-from ccd_casadi.extensions.drives.drive_verdict import lifted, verdict_entry
+from ccd_casadi.extensions.drives.drive_verdict import lift_loops, verdict_entry
 from ccd_casadi.extensions.drives.two_rates import place_name
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.lti.frequency_grid import frequency_grid
-from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.loop import zoh
 from ccd_casadi.reporting.concerns import lines_of
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.reporting.facts import theta_words
@@ -33,7 +33,7 @@ def sheet_rows(design: DriveDesign, today: Today | None = None) -> list[dict[str
     rows, given = [], today or {}
     own = zip(design.cascade.settings, design.values.tolist(), strict=True)
     for setting, value in [*own, *design.feedforward, *design.cascade.current]:
-        shown = setting.shown(round(value * setting.per_si / setting.step))
+        shown = setting.format_steps(round(value * setting.per_si / setting.step))
         old = given.get(setting.name, given.get(setting.number))
         rows.append({"number": setting.number, "name": setting.name, "value": shown,
                      "unit": setting.unit, "today": old})  # fmt: skip
@@ -46,7 +46,7 @@ def _move_errors(drive: DriveProblem, design: DriveDesign) -> tuple[float, float
     if not design.feedforward:
         return None
     plant = drive.uncertain.plant(drive.uncertain.nominal).plant_si()
-    G, own = sampled(plant, drive.sampling.period, drive.sampling.delay), design.cascade
+    G, own = zoh(plant, drive.sampling.period, drive.sampling.delay), design.cascade
     first, second = (program_of(own, design.values, ahead) for ahead in (design.ahead, (0.0, 0.0)))
     return (following_error(first, G, own.position, own.velocity),
             following_error(second, G, own.position, own.velocity))  # fmt: skip
@@ -84,7 +84,7 @@ def named_theta(problem: DriveProblem, theta: Sequence[float]) -> dict[str, floa
 
 
 def figures_of(problem: DriveProblem, at: DriveAt) -> dict[str, Any]:
-    """What is known of a θ before rounding."""
+    """Write the figures of a θ before rounding."""
     return {"theta": named_theta(problem, at.theta), "bandwidth_hz": at.candidate.bandwidth / HZ,
             "hardware_cost": at.cost, "objective": at.objective}  # fmt: skip
 
@@ -103,10 +103,10 @@ def codesign_words(problem: DriveProblem, entry: Mapping[str, Any]) -> str:
 def sheet_figures(
     problem: DriveProblem, design: DriveDesign, answer: Mapping[str, Any]
 ) -> list[tuple[str, str]]:
-    """What the design reaches, each figure with its limit; `answer` by `entry`."""
+    """List what the design reaches, each figure with its limit; `answer` by `entry`."""
     own, (Kv, _, Tn), of = design.cascade, design.values[:3], problem.problem
     rounded, free = design.bandwidth / HZ, design.free.bandwidth / HZ
-    ruled = own.allowed(design.values).min() <= design.bandwidth * (1.0 + 1e-9)
+    ruled = own.allowed_bandwidths(design.values).min() <= design.bandwidth * (1.0 + 1e-9)
     least = "what decay and filters allow" if ruled else "the least of the plants"
     found = []
     if of.names:
@@ -256,7 +256,7 @@ def _block(
 
 def _loops(drive: DriveProblem, design: DriveDesign) -> c.Figure:
     """|S| of the model, and L = 1/S - 1 of model and corners, at every place; |K|."""
-    bounds, own, loops = drive.bounds, design.cascade, lifted(drive, design)
+    bounds, own, loops = drive.bounds, design.cascade, lift_loops(drive, design)
     rates = drive.uncertain.plant(drive.uncertain.nominal).plant_si().rates
     low = bounds.omega_low / HZ
     # above half its rate the position is aliased

@@ -28,10 +28,10 @@ from ccd_casadi.extensions.drives.cascade import Cascade
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import PlantFigures, SetCertificate
 from ccd_casadi.lti.frequency_grid import root_flanks
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import plural
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class LiftedLoop:
 
     @property
     def poles(self) -> np.ndarray:
-        """Of Φ, over one instant, in rad/s."""
+        """The poles of Φ, over one instant, in rad/s."""
         roots = np.linalg.eigvals(self.step).astype(complex)
         return np.asarray(np.log(roots[np.abs(roots) > 1e-12]) / (self.slower * self.period))
 
     def sensitivity(self, place: int | None, omega: Array) -> Array:
         """|S| at a place (k,), as the module defines it, at ω in rad/s."""
         found = np.abs(self.fundamental(place, omega))
-        S = self.places[place].swept(omega)
+        S = self.places[place].sweep(omega)
         if S.shape[1:] == (1, 1):
             return found
         return np.asarray(np.fmax(found, np.abs(np.linalg.eigvals(S)).max(axis=1)))
@@ -91,7 +91,7 @@ class LiftedLoop:
 
     def fundamental(self, place: int | None, omega: Array) -> np.ndarray:
         """The part of S at a place that has the frequency of d (k,), at ω in rad/s."""
-        S = self.places[place].swept(omega)
+        S = self.places[place].sweep(omega)
         if S.shape[1:] == (1, 1):
             return np.asarray(S[:, 0, 0])
         turn = np.exp(1j * omega[:, None] * self.period * np.arange(self.slower))
@@ -134,7 +134,7 @@ def lift(cascade: Cascade, values: Array, system: StateSpace) -> LiftedLoop:
     every = list(range(N))
     instants = {cascade.position: (0, every)} if one else {
         cascade.position: (0, [0]), cascade.velocity: (1, every), None: (2, every)}  # fmt: skip
-    places = {place: _stacked(sequence, column, used, cascade.period)
+    places = {place: _stack(sequence, column, used, cascade.period)
               for place, (column, used) in instants.items()}  # fmt: skip
     step = np.eye(n + m + 1)
     for A, *_ in sequence:
@@ -142,7 +142,7 @@ def lift(cascade: Cascade, values: Array, system: StateSpace) -> LiftedLoop:
     return LiftedLoop(step, places, N, cascade.period)
 
 
-def _stacked(
+def _stack(
     sequence: Sequence[tuple[Array, Array, Array, Array]],
     place: int,
     used: list[int],
@@ -169,7 +169,7 @@ def judge_two_rates(
 
     `worst` of the certificate has figures over their bounds by the names of the bounds.
     """
-    found = [_figures(lift(cascade, values, sampled(plant, sampling.period, sampling.delay)),
+    found = [_figures(lift(cascade, values, zoh(plant, sampling.period, sampling.delay)),
                       cascade, bounds, options) for plant in plants]  # fmt: skip
     unstable = sum(not one.stable for one, _ in found)
     worst: dict[str, float] = {}
@@ -178,7 +178,7 @@ def judge_two_rates(
             worst[name] = max(share, worst.get(name, 0.0))
     bandwidth = float(np.min([one.bandwidth for one, _ in found]))
     over = {name: share for name, share in worst.items() if not share <= 1.0 + options.room}
-    count = counted(len(plants), "plant")
+    count = plural(len(plants), "plant")
     words = f"every bound holds on {count}, by lifting"
     if over:
         name = max(over, key=lambda name: over[name])

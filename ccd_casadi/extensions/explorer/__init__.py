@@ -32,7 +32,7 @@ EXTENSION = Extension(
            "help": "a case file, or the folder of a finished solve"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.support.errors import require
 
     require("bokeh", "explore")

@@ -15,7 +15,7 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.drawing.svg import GREEN, ORANGE, PURPLE
 from ccd_casadi.extensions.explorer import ASSETS
-from ccd_casadi.extensions.explorer.knobs import Knobs, Notch, Notched, NotchOptions, notched
+from ccd_casadi.extensions.explorer.knobs import Knobs, Notch, Notched, NotchOptions, judge_notched
 from ccd_casadi.extensions.explorer.painter import ON_DARK, Change, PanelFigure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.nodes import Positions, names_in
@@ -51,7 +51,7 @@ class PlacesFigure:
         )  # fmt: skip
         made.toolbar.logo = None
         made.scatter(**_columns(nodes), size=4, color="#808080")
-        # One source: of several the browser would tell one by one, as before the others' answer.
+        # One source: of several the browser would report one by one, as before the others' answer.
         self._points = Positions((*places.sensors, *places.actuators), known)
         a, b = len(places.sensors), len(places.actuators)
         self._styles = {"colour": [GREEN] * a + [ORANGE] * b, "marker": ["circle"] * a + ["x"] * b,
@@ -66,7 +66,7 @@ class PlacesFigure:
         self.figure = made
 
     def marks(self, theta: Sequence[float]) -> Change:
-        """What shows them at θ."""
+        """Return the change that shows the places at θ."""
         self._shown = np.append(theta, self._held)
         return self._source, {"data": _columns(self._points.at(self._shown)) | self._styles}
 
@@ -81,7 +81,8 @@ class PlacesFigure:
 
 
 def _columns(points: Array) -> dict[str, list[float]]:
-    """As lists: of an array that is a part of another the browser would send all of that back."""
+    """Write points as lists: of an array that is a part of another the browser would send all of
+    that back."""
     return {"x": (MM * points[:, 0]).tolist(), "y": (MM * points[:, 1]).tolist()}
 
 
@@ -146,7 +147,8 @@ class Controls:
             changed(let_go, search)
 
     def _hide(self) -> None:
-        """What does nothing to this kind of controller, or to a loop that is not sampled."""
+        """Hide the widgets that have no effect on this kind of controller, or on a loop that is not
+        sampled."""
         structured = self.structure.value == "sections"
         for widget in (self.omega_S, self.omega_T, self.always):
             widget.visible = not structured
@@ -158,7 +160,7 @@ class Controls:
                 self.sampled, self.rate, self.delay, self.always]  # fmt: skip
 
     def knobs(self) -> Knobs:
-        """What they say."""
+        """Read the knobs from the widgets."""
         sliders = zip(self._theta, self._scale, strict=True)
         return Knobs(
             theta=tuple(float(np.clip(s.value, s.start, s.end)) / k for s, k in sliders),
@@ -197,7 +199,7 @@ def slider(
 
 
 def power() -> CustomJSTickFormatter:
-    """What lets a slider of a logarithm show the number itself."""
+    """Make the formatter by which a slider of a logarithm shows the number itself."""
     return CustomJSTickFormatter(code="return Number(Math.pow(10, tick).toPrecision(4)).toString()")
 
 
@@ -266,7 +268,7 @@ class NotchFigure:
 
     @property
     def sliders(self) -> tuple[Slider, ...]:
-        """Of frequency, gain and damping."""
+        """The sliders of frequency, gain and damping."""
         return self._hz, self._depth, self._damping
 
     def root(self) -> Any:
@@ -281,10 +283,10 @@ class NotchFigure:
             top = max(view.peaks, key=lambda peak: peak[1], default=(view.bandwidth_hz, 0.0))[0]
             self._hz.update(start=float(low), end=float(high), value=float(np.log10(top)))
         notch = Notch(*(10.0 ** float(each.value) for each in self.sliders))
-        return None if notch.depth > self._none else notched(view, notch)
+        return None if notch.depth > self._none else judge_notched(view, notch)
 
     def mark(self, view: LoopView | None) -> Change:
-        """What shows the handle, on |L| of the notched loop."""
+        """Return the change that shows the handle, on |L| of the notched loop."""
         if view is None:
             return self._handle, {"data": {"x": [], "y": []}}
         hz, depth = (10.0 ** float(each.value) for each in self.sliders[:2])

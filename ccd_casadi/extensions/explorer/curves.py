@@ -41,7 +41,7 @@ AT_REST = Move(NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, LIMITS.window)
 
 @dataclass(frozen=True)
 class Curves:
-    """Of one design: its loop on the plant looked at, over frequency and over time.
+    """The curves of one design: its loop on the plant that is shown, over frequency and over time.
 
     `step`: y of the first output (s) after a step of its reference. An unstable loop has no step
     and no move (`AT_REST`).
@@ -54,13 +54,13 @@ class Curves:
 
     @cached_property
     def poles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the plant, of K and of the loop (of a sampled one ln(z)/T): complex, Hz."""
+        """The poles of the plant, of K and of the loop (of a sampled one ln(z)/T): complex, Hz."""
         loop = self.view.loop
         return loop.plant.poles / HZ, loop.controller.poles / HZ, loop.poles / HZ
 
     @property
     def unstable(self) -> bool:
-        """Of the loop: it has no step, no move and no margins."""
+        """Whether the loop is unstable: it has no step, no move and no margins."""
         return not self.poles[2].real.max() < 0.0
 
     @property
@@ -92,7 +92,7 @@ def curves_of(design: ExploredDesign) -> Curves | None:
     loop = loop_on(problem, plant.plant_si(), K)
     bandwidth = design.bandwidth_hz if np.isfinite(design.bandwidth_hz) else plant.omega_0 / HZ
     gamma = float(np.nan_to_num(design.figures.certificate.norm_bound))
-    bounded = kind_of(problem).bounded(design.weights, gamma, design.bandwidth_hz)
+    bounded = kind_of(problem).gain_bounds(design.weights, gamma, design.bandwidth_hz)
     f = design.figures
     top, at = f.sensitivity_peak, f.sensitivity_peak_frequency
     own = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
@@ -178,7 +178,7 @@ def move_words(curves: Curves | None, own: bool = False) -> str:
 
 
 def machine_html(design: ExploredDesign, start: Sequence[float], reference: float) -> str:
-    """Its drawing beside that of the start, masses and springs, or its modes."""
+    """Draw the machine beside that of the start, masses and springs, or its modes."""
     plant = plant_of(design.problem)
     if plant.drawing is not None:
         drawn = plant.drawing({"this design": design.theta, "the start": start}).drawing
@@ -270,7 +270,7 @@ def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -
 
 
 def _poles(c: Curves) -> Panel:
-    """Of the plant, of K and of the loop: frequency and damping."""
+    """Draw the poles of the plant, of K and of the loop: frequency and damping."""
     curves = []
     drawn_designs = (("plant", GREY, "o"), ("controller", GREEN, "^"), ("closed loop", BLUE, "x"))
     for roots, (label, colour, marker) in zip(c.poles, drawn_designs, strict=True):

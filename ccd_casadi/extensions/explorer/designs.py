@@ -16,7 +16,7 @@ import numpy as np
 from ccd_casadi.codesign.verdict import VerdictOptions
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure.certificate import SetCertificate
-from ccd_casadi.inner_problem.objective import violated
+from ccd_casadi.inner_problem.objective import violations
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -29,7 +29,7 @@ from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
-from ccd_casadi.inner_problem.structured_search import prepared, with_range
+from ccd_casadi.inner_problem.structured_search import prepare_search, with_range
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
 from ccd_casadi.kernels.certified_design import failed_row
 from ccd_casadi.lti.state_space import StateSpace
@@ -40,7 +40,7 @@ from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.unit_kinds import units_of
 from ccd_casadi.sampling.units import hashes_of, sample_key
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.terminal import Log
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import (
@@ -54,7 +54,7 @@ from ccd_casadi.synthesis.weights import Weights
 
 
 class How(StrEnum):
-    """How the controller was chosen."""
+    """The way in which the controller was chosen."""
 
     PRESENT = "one synthesis at the present weights"
     SEARCHED = "full inner search: the largest bandwidth at this θ"
@@ -63,7 +63,7 @@ class How(StrEnum):
 
 
 class Standing(StrEnum):
-    """What may be said of a design, from the best to the worst."""
+    """The standing of a design, from the best to the worst."""
 
     KEPT = "certified, keeps its bounds"
     MISSED = "certified, misses a bound"
@@ -123,7 +123,7 @@ class ExploredDesign:
 
     @property
     def theta(self) -> tuple[float, ...]:
-        """Of the sliders."""
+        """The θ of the sliders."""
         return self.knobs.theta
 
     @property
@@ -165,7 +165,7 @@ def present(
     )
 
 
-def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> ExploredDesign:
+def search_inner(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> ExploredDesign:
     """The inner problem at θ, as the command `inner` solves it, and the controller there.
 
     Where no design is feasible: the one nearest to it, if any was certified.
@@ -196,7 +196,7 @@ def _design(
     weights, inner, plant = problem.weights.at(*point), problem.inner, design.plant
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
     made = recertified_in_si(plant, made, inner.omega_low)
-    standing, reason = judged(problem, made.figures, violated(problem, knobs.theta))
+    standing, reason = judge_figures(problem, made.figures, violations(problem, knobs.theta))
     if elements.error > OWN and standing is not Standing.REFUSED:
         standing, reason = Standing.NEAR, ""
     finite = all(np.isfinite(getattr(made.controller, part)).all() for part in "ABCD")
@@ -231,10 +231,10 @@ def without_controller(
     )
 
 
-def judged(
+def judge_figures(
     problem: CoDesignProblem, figures: DesignFigures, broken: Sequence[str] = ()
 ) -> tuple[Standing, str]:
-    """What may be said of a design's figures, and why no more; `broken`: constraints on θ."""
+    """Judge a design by its figures, with the reason; `broken`: constraints on θ."""
     if not figures.certified:
         return Standing.REFUSED, figures.outcome.value
     missed = missed_bounds(problem.inner, figures)
@@ -261,7 +261,7 @@ class Designed:
     unit: Unit
 
 
-def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesignProblem:
+def with_warm_starts_of(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesignProblem:
     """The problem with the warm starts, plant set and channels of one that was designed before."""
     if known is None:
         return problem
@@ -272,11 +272,11 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     return with_state(replace(problem, controller=taken, start=known.start), **vars(state))
 
 
-def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:
+def design_controller(task: tuple[CoDesignProblem, Knobs], log: Log) -> Designed:
     """The best certified controller at θ from the problem's warm starts, or from many starts."""
     problem, knobs = task
     if not state_of(problem).warm_starts:
-        problem = prepared(replace(problem, start=knobs.theta), tell=tell)[0]
+        problem = prepare_search(replace(problem, start=knobs.theta), log=log)[0]
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
     own = sample_key(inner, knobs.theta)
@@ -293,7 +293,7 @@ def judged_design(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How
     controller = structure_of(problem).state_space(kappa)
     found = certify_corners(problem, knobs.theta, controller)
     elements = elements_at(problem, knobs.theta)
-    broken = violated(problem, knobs.theta)
+    broken = violations(problem, knobs.theta)
     standing, reason = _standing(found)
     if standing is Standing.KEPT and broken:
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"

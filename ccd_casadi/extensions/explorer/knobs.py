@@ -162,7 +162,8 @@ class Notched:
 
     @property
     def bandwidth_hz(self) -> float:
-        """Where σ_max(S) first crosses -3 dB, between two frequencies; NaN where it does not."""
+        """The frequency at which σ_max(S) first crosses -3 dB, between two frequencies; NaN where
+        it does not."""
         above = np.flatnonzero(self.gain >= 2**-0.5)
         if not above.size or above[0] == 0:
             return np.nan
@@ -170,7 +171,7 @@ class Notched:
         return float(np.exp(np.interp(-0.5 * np.log(2.0), *np.log((self.gain[i], self.hz[i])))))
 
     def words(self, S_max: float) -> str:
-        """What the notch makes of the loop."""
+        """Describe the loop with the notch."""
         n, m, top = self.notch, self.margins, int(self.gain.argmax())
         said = f"notch at {number(n.hz, 4)} Hz, to {number(n.depth, 2)} of the gain: "
         if not self.stable:
@@ -200,7 +201,7 @@ class Notched:
         }  # fmt: skip
 
 
-def notched(view: LoopView, notch: Notch, options: NotchOptions = NotchOptions()) -> Notched:
+def judge_notched(view: LoopView, notch: Notch, options: NotchOptions = NotchOptions()) -> Notched:
     """Judge a loop with a notch behind its controller; `view`: without it, on the page's
     frequencies.
     """

@@ -15,9 +15,9 @@ from scipy.linalg import eigh
 
 from ccd_casadi.extensions.explorer.designs import Elements
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, nearby_model
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess, tell
+from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess, log
 
 Theta = tuple[float, ...]
 
@@ -59,7 +59,7 @@ class KnownPlant:
         self.model, self.used = nearby_model(self.plant, used, known[-1]), used
 
     def at(self, theta: Theta) -> Elements:
-        """What there is at θ without solving the plant.
+        """Return what is known at θ without solving the plant.
 
         The error is the one last measured, infinite farther away than that or before any.
         """
@@ -99,10 +99,10 @@ Then = Callable[[Any], None]
 Failed = Callable[[BaseException], None]
 
 
-def _working(given: tuple[bool, Callable[[Any, Tell], Any], Any]) -> Any:
+def _working(given: tuple[bool, Callable[[Any, Log], Any], Any]) -> Any:
     user_code, work, task = given
     with permit_user_code(user_code):
-        return work(task, tell)
+        return work(task, log)
 
 
 class Background:
@@ -117,7 +117,7 @@ class Background:
         self._asking, self._thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._closed = False
 
-    def ask(self, work: Callable[[Any, Tell], Any], task: Any, heard: Tell = silent) -> Future:
+    def ask(self, work: Callable[[Any, Log], Any], task: Any, heard: Log = silent) -> Future:
         """Do what the user waits for, one after the other; `heard` is given how far it is."""
 
         def answered() -> Any:
@@ -162,7 +162,7 @@ class Background:
 
 
 def print_failure(error: BaseException) -> None:
-    """On stderr: what the page can do without."""
+    """Warn on stderr of a failure that the page can do without."""
     print(f"warning: {error}", file=sys.stderr)
 
 
@@ -170,10 +170,10 @@ class Solve:
     """`python -m ccd_casadi.solve` of a case, in a process of its own, into a folder."""
 
     def __init__(
-        self, case: Path, folder: Path, options: Sequence[str], tell: Tell,
+        self, case: Path, folder: Path, options: Sequence[str], log: Log,
         ended: Callable[[int], None],
     ) -> None:  # fmt: skip
-        """`tell` is given every line, `ended` the exit code, both in another thread."""
+        """`log` is given every line, `ended` the exit code, both in another thread."""
         command = [sys.executable, "-m", "ccd_casadi.solve", str(case), "--out", str(folder)]
         self._process = subprocess.Popen(
             [*command, *options],
@@ -185,14 +185,14 @@ class Solve:
             assert self._process.stdout is not None
             with self._process.stdout as lines:  # universal newlines: a bar's \r ends one too
                 for line in lines:
-                    tell(line.rstrip())
+                    log(line.rstrip())
             ended(self._process.wait())
 
         self._interrupted = False
         threading.Thread(target=read, daemon=True).start()
 
     def stop(self) -> None:
-        """As Ctrl-C does, and what is sampled is kept; asked again, without more ado."""
+        """Stop as Ctrl-C does, and keep what is sampled; a second call ends the process at once."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM if self._interrupted else signal.SIGINT)
             self._interrupted = True

@@ -37,7 +37,13 @@ from ccd_casadi.extensions.explorer.curves import (
     standing_html,
     with_sampled,
 )
-from ccd_casadi.extensions.explorer.designs import Designed, ExploredDesign, How, anchored, designed
+from ccd_casadi.extensions.explorer.designs import (
+    Designed,
+    ExploredDesign,
+    How,
+    design_controller,
+    with_warm_starts_of,
+)
 from ccd_casadi.extensions.explorer.knobs import Knobs
 from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.painter import (
@@ -55,7 +61,7 @@ from ccd_casadi.extensions.explorer.pins import (
     run_surrogate,
     steepest_axes,
 )
-from ccd_casadi.extensions.explorer.session import Session, searched_exactly
+from ccd_casadi.extensions.explorer.session import Session, search_exactly
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -65,7 +71,7 @@ from ccd_casadi.support.text import package_text
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
 LINES = 40  # of a solve's output
-BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
+BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that reports progress
 NO_NOTCH = "none: drag the diamond down from the curve of |L|, or move its gain below 1"
 SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
 
@@ -87,7 +93,7 @@ class ExplorerPage:
                         cursor=line if name in OVER_HZ else None, whole_circles=name == "nyquist")
             for name, (heading, log_x, log_y) in FIGURES.items()
         ]  # fmt: skip
-        self.controls = Controls(session.case, session.start, self.moved, dark)
+        self.controls = Controls(session.case, session.start, self.on_moved, dark)
         if kept.knobs is not None:
             self.controls.put(kept.knobs)
         self.map = MapFigure(parameters, self.draw_map, dark)
@@ -96,7 +102,7 @@ class ExplorerPage:
         loop = next(made for made in self.figures if made.name == "L")
         self.notch = NotchFigure(loop, dark, self._notch_moved)
         run, problem = session.run, session.problems.at(session.start)
-        self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
+        self.places = [PlacesFigure(problem, self._on_placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._moves = True, 0  # moves of sliders up to now
         self._answer_due = False  # to all moves since the last answer,
@@ -115,7 +121,7 @@ class ExplorerPage:
         nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
         self.answer = ColumnDataSource(nothing, name="answer")
         self._message, self._serial = Message(), 0
-        self._message.applied_in(document)
+        self._message.apply_in(document)
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
@@ -125,7 +131,7 @@ class ExplorerPage:
         self.stop = button("Stop the solve", "stop", self.stop_solve, dark)
         self.stop.disabled = True
         self._place()
-        self.moved(True)
+        self.on_moved(True)
 
     def _place(self) -> None:
         made = [button(*words, self._dark) for words in (
@@ -157,14 +163,14 @@ class ExplorerPage:
 
     # drags
 
-    def _placed(self, theta: Array) -> None:
+    def _on_placed(self, theta: Array) -> None:
         """A place was dragged: the sliders move to its θ, within the box."""
         low, high = zip(*((p.lower, p.upper) for p in self.session.case.theta), strict=True)
         inside = tuple(np.clip(theta, low, high).tolist())
         self.controls.put(replace(self.controls.knobs(), theta=inside))
-        self.moved(True)
+        self.on_moved(True)
 
-    def moved(self, let_go: bool, of_search: bool = False) -> None:
+    def on_moved(self, let_go: bool, of_search: bool = False) -> None:
         """A slider moved: answer soon, once for all that moved meanwhile.
 
         `of_search`: it is one that a search alone answers.
@@ -186,10 +192,10 @@ class ExplorerPage:
 
         self.document.add_timeout_callback(still, TOGETHER)
 
-    def improved(self) -> None:
+    def on_improved(self) -> None:
         """The model of a slow plant was made anew: draw what is not the plant's own on it."""
         if self.now is not None and not self.now.design.elements.exact:
-            self.moved(False)
+            self.on_moved(False)
 
     def _answer(self) -> None:
         """The design at the sliders: of a full search where a slider was let go or only a search
@@ -268,10 +274,10 @@ class ExplorerPage:
         self._paint()
 
     def settle(self) -> None:
-        """When the answer is on its way: write what was looked at, draw the landscape."""
-        self.document.add_next_tick_callback(self._settled)
+        """Write what was shown and draw the landscape, once the answer is on its way."""
+        self.document.add_next_tick_callback(self._on_settled)
 
-    def _settled(self) -> None:
+    def _on_settled(self) -> None:
         seen, self._unsaved = self._unsaved, []
         self.session.keep(seen)
         self.draw_map()
@@ -308,11 +314,11 @@ class ExplorerPage:
         self.note.text = "<p>solving the model and searching at this θ …</p>"
         if not is_busy:
             task = (self.session.problems.at(knobs), knobs)
-            search = self.background.ask(searched_exactly, task)
+            search = self.background.ask(search_exactly, task)
             failed = self._in_turn(self._search_failed)
-            self.background.answer(search, self._in_turn(self._searched), failed)
+            self.background.answer(search, self._in_turn(self._on_searched), failed)
 
-    def _searched(self, found: tuple[ExploredDesign, str]) -> None:
+    def _on_searched(self, found: tuple[ExploredDesign, str]) -> None:
         design, modes = found
         newest, self._to_search = self._to_search, None
         known = self.session.known
@@ -324,7 +330,7 @@ class ExplorerPage:
             words = f"the frequencies drawn while you dragged were off by {100.0 * off:.2g} % here"
             self.note.text = f"<p>{words}</p>"
         if len(known.exact) > count:
-            self.background.renew(known, self._in_turn(lambda _: self.improved()))
+            self.background.renew(known, self._in_turn(lambda _: self.on_improved()))
         self.modes.text = modes
         if newest in (None, design.knobs) and self.controls.knobs() == design.knobs:
             self.show(design)
@@ -341,18 +347,18 @@ class ExplorerPage:
     def design_structured(self) -> None:
         """A controller of fixed structure at this θ."""
         knobs = self.controls.knobs()
-        problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
-        self.waits_for(self.background.ask(designed, (problem, knobs), self.heard))
+        problem = with_warm_starts_of(self.session.problems.at(knobs), self.session.designed_for)
+        self.waits_for(self.background.ask(design_controller, (problem, knobs), self.heard))
 
     def waits_for(self, design: Future) -> None:
         """A design is under way, which this page shows once it ends."""
         self.design.disabled = self._is_designing = self._design_began = True
         self._designing("it takes seconds")
         failed = self._in_turn(self._design_failed)
-        self.background.answer(design, self._in_turn(self._designed), failed)
+        self.background.answer(design, self._in_turn(self._on_designed), failed)
 
     def heard(self, words: str) -> None:
-        """How far a design is, in any thread."""
+        """Show how far a design is, from any thread."""
         self._in_turn(self._designing)(words)
 
     def _designing(self, words: str) -> None:
@@ -367,7 +373,7 @@ class ExplorerPage:
         self._end_design()
         self._complain(str(error))
 
-    def _designed(self, found: Designed) -> None:
+    def _on_designed(self, found: Designed) -> None:
         self._end_design()
         design = self.session.took_designed(found)
         if design is None:
@@ -376,7 +382,7 @@ class ExplorerPage:
             self.show(design)
             self.settle()
         else:  # the sliders moved meanwhile: it is judged where they are
-            self.moved(True)
+            self.on_moved(True)
 
     def pin(self) -> None:
         """Keep the present design beside those to come."""
@@ -385,12 +391,12 @@ class ExplorerPage:
 
     def go(self) -> None:
         """Move the sliders to the selected pin."""
-        if (pinned := self.pins.selected()) is not None:
+        if (pinned := self.pins.first_selected()) is not None:
             self.controls.put(pinned.design.knobs)
-            self.moved(True)
+            self.on_moved(True)
 
     def write_case(self) -> None:
-        """Save as case."""
+        """Save the design as a case."""
         place = self.session.save(self.controls.knobs())
         self.output.text = f"<p>saved {escape(str(place))}</p>"
 
@@ -404,7 +410,7 @@ class ExplorerPage:
         self._print_line("")
 
     def stop_solve(self) -> None:
-        """As Ctrl-C."""
+        """Stop the solve as Ctrl-C does."""
         if self.solve is not None:
             self.solve.stop()
 
@@ -427,14 +433,14 @@ class ExplorerPage:
             self.output.text += f'<p><a href="{place}" target="_blank">the report of it</a></p>'
 
     def _go_to_solved(self) -> None:
-        """Its design on the sliders, its surrogate in the landscape."""
+        """Put the solved design on the sliders and its surrogate in the landscape."""
         try:
             run = read_run(self._solved)
         except UserError:
             return  # what it ended with is no certified design
         self.session.run, self._surrogate = run, run_surrogate(run.folder)
         self.controls.put(replace(self.controls.knobs(), theta=run.theta))
-        self.moved(True)
+        self.on_moved(True)
 
     def close(self) -> None:
         """The page was closed: a solve goes on only while somebody sees it."""

@@ -28,16 +28,17 @@ Change = tuple[Model, dict[str, Any]]  # a model, and new values of its properti
 
 
 class Message(DataModel):
-    """Its content reaches every figure in one piece.
+    """A message whose content reaches every figure in one piece.
 
-    Models are told by their ids: references would make the server walk through the whole document.
+    Models are identified by their ids: references would make the server walk through the whole
+    document.
     Each array by itself would be two more frames on the socket. All else is one text: lists would
     be walked through twice, 3 ms a drag.
     """
 
     content: Any = Anything(default=None)
 
-    def applied_in(self, document: Document) -> None:
+    def apply_in(self, document: Document) -> None:
         """Have the browser apply what comes, and what came before the page was there."""
         apply = CustomJS(args={"message": self}, code=package_text(f"{ASSETS}/apply.js"))
         self.js_on_change("content", apply)
@@ -45,12 +46,12 @@ class Message(DataModel):
 
     def send(self, words: Mapping[str, str], changes: Sequence[Change]) -> None:
         """Set the HTML of elements of the page by their ids, and properties of models."""
-        found, numbers = packed(changes)
+        found, numbers = pack(changes)
         self.content = [json.dumps([dict(words), found], allow_nan=False), numbers]
 
 
-def packed(changes: Sequence[Change]) -> tuple[list[Any], np.ndarray]:
-    """Changes by the models' ids, where an array tells its place in the one of all numbers."""
+def pack(changes: Sequence[Change]) -> tuple[list[Any], np.ndarray]:
+    """Changes by the models' ids, where an array has its place in the one of all numbers."""
     arrays: list[np.ndarray] = []
     taken = 0
 
@@ -164,9 +165,9 @@ class PanelFigure:
             made.add_tools(models.CrosshairTool(overlay=cursor))
 
     def changes(self, panel: Panel, colour: str, dash: str, frame: bool) -> list[Change]:
-        """What paints a panel; `colour` and `dash` of the present design's curves, nothing for a
-        dash that is its own. `frame`: the axes are set anew; else they only widen, an axis that is
-        shared not even that: while one drags they stand still, and cost nothing."""
+        """List the changes that paint a panel; `colour` and `dash` of the present design's curves,
+        nothing for a dash that is its own. `frame`: the axes are set anew; else they only widen, an
+        axis that is shared not even that: while one drags they stand still, and cost nothing."""
         own = [c for c in panel.curves if _is_own(c)]
         others = [c for c in panel.curves if c.line and not _is_own(c)]
         drawn = [
@@ -195,7 +196,7 @@ class PanelFigure:
             others.append(Curve(*line, "", v.colour, "--", width=0.9))
         found = [
             _rows(self.own, map(self._line, drawn)), _rows(self._lines, map(self._line, others)),
-            _rows(self._areas, areas), _rows(self._spots, spots), self._worded(panel, ends),
+            _rows(self._areas, areas), _rows(self._spots, spots), self._place_words(panel, ends),
         ]  # fmt: skip
         for axis, label in ((self.figure.xaxis, panel.x_label), (self.figure.yaxis, panel.y_label)):
             found.append((axis[0], {"axis_label": label}))
@@ -223,8 +224,8 @@ class PanelFigure:
         return (np.asarray(c.x, float), np.asarray(c.y, float), self._on(c.colour), DASHES[c.line],
                 c.width, c.label)  # fmt: skip
 
-    def _worded(self, panel: Panel, ranges: list[tuple[float, float]]) -> Change:
-        """The words of marks and levels where they do not meet, in the size that the browser told
+    def _place_words(self, panel: Panel, ranges: list[tuple[float, float]]) -> Change:
+        """The words of marks and levels where they do not meet, in the size that the browser gave
         last: of a figure that was not laid out yet, a usual one."""
         if not any([m.text for m in panel.marks] + [v.text for v in panel.levels]):
             return _rows(self._words, ())
@@ -260,7 +261,7 @@ class PanelFigure:
         return _rows(self._words, words)
 
     def _range(self, panel: Panel, axis: int) -> tuple[float, float]:
-        """Of a panel's own, or over its curves and those beside it."""
+        """Return the range that the panel gives, or the one over its curves and those beside it."""
         log = (self._log_x, self._log_y)[axis]
         given = (panel.x_range, panel.y_range)[axis]
         if given is not None:
@@ -278,7 +279,7 @@ class PanelFigure:
 
 
 def legend_html(panel: Panel, own: str = BLUE) -> str:
-    """What the curves of a panel are, each in its colour: `own` of the present design's."""
+    """Write the legend of a panel's curves, each in its colour: `own` of the present design's."""
     items = [(SIGNS.get(c.marker) or SIGNS[c.line], own if c.colour == BLUE else c.colour, c.label)
              for c in panel.curves]  # fmt: skip
     items += [("▬", band.colour, band.label) for band in panel.bands]
@@ -302,7 +303,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _is_own(curve: Curve) -> bool:
-    """Of the present design itself, not of what bounds it."""
+    """Decide whether a curve is of the present design itself, not of what bounds it."""
     return curve.colour == BLUE and curve.line == "-"
 
 

@@ -158,12 +158,12 @@ class MapFigure:
 
     @property
     def axes(self) -> tuple[int, int]:
-        """The parameters chosen."""
+        """The two parameters that are chosen."""
         i, j = (self.names.index(select.value) for select in self._selects)
         return i, j
 
     def mark(self, theta: Sequence[float]) -> Change:
-        """What shows the present design."""
+        """Return the change that shows the present design."""
         (i, j), (k, m) = self.axes, self._scales()
         return self._here, {"data": {"x": [k * theta[i]], "y": [m * theta[j]]}}
 
@@ -227,7 +227,8 @@ LINE = '<span style="color:<%= value %>">▬▬</span>'
 
 @dataclass
 class Kept:
-    """What outlives a reload of a tab: where its sliders stand, and its pins by name."""
+    """The state that outlives a reload of a tab: the values of its sliders, and its pins by
+    name."""
 
     knobs: Knobs | None = None
     pinned: list[tuple[str, Drawn]] = field(default_factory=list)
@@ -268,7 +269,7 @@ class Pins:
         return self.kept.pinned
 
     def add(self, drawn: Drawn) -> None:
-        """Pin one."""
+        """Pin a design."""
         self.kept.count += 1
         self.pinned.append((f"pin {self.kept.count}", drawn))
         self._show()
@@ -279,7 +280,7 @@ class Pins:
         self.pinned[:] = [pin for i, pin in enumerate(self.pinned) if i not in chosen]
         self._show()
 
-    def selected(self) -> Drawn | None:
+    def first_selected(self) -> Drawn | None:
         """The first of those selected, the last one where none is; None without a pin."""
         chosen = self._chosen() or ([len(self.pinned) - 1] if self.pinned else [])
         return self.pinned[chosen[0]][1] if chosen else None

@@ -20,7 +20,7 @@ from tornado.web import StaticFileHandler
 
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.extensions.explorer.curves import FIGURES
-from ccd_casadi.extensions.explorer.designs import designed
+from ccd_casadi.extensions.explorer.designs import design_controller
 from ccd_casadi.extensions.explorer.known_plant import Background
 from ccd_casadi.extensions.explorer.page import SOLVED, ExplorerPage
 from ccd_casadi.extensions.explorer.pins import Kept
@@ -83,7 +83,7 @@ class Explorer:
         self._server = BaseServer(IOLoop.current(), application, served)
         self._first = self._design_first() if session.undesigned else None
         if session.known is not None:
-            self.background.renew(session.known, self._renewed)
+            self.background.renew(session.known, self._on_renewed)
 
     def _design_first(self) -> Future:
         """The controller that pages begin with, designed while they open; they hear how far it
@@ -95,7 +95,7 @@ class Explorer:
                 page.heard(words)
 
         task = (session.problems.at(session.start), session.start)
-        return self.background.ask(designed, task, heard)
+        return self.background.ask(design_controller, task, heard)
 
     def _document(self, document: Document) -> None:
         context = document.session_context
@@ -124,9 +124,9 @@ class Explorer:
         self._pages.remove(page)
         page.close()
 
-    def _renewed(self, _: None) -> None:
+    def _on_renewed(self, _: None) -> None:
         for page in list(self._pages):
-            page.document.add_next_tick_callback(page.improved)
+            page.document.add_next_tick_callback(page.on_improved)
 
     def run(self, *, show: bool) -> None:
         """Serve until Ctrl-C."""

@@ -17,22 +17,22 @@ from ccd_casadi.extensions.explorer.designs import (
     Elements,
     ExploredDesign,
     How,
-    anchored,
     elements_at,
     judged_design,
     present,
-    searched,
+    search_inner,
+    with_warm_starts_of,
     without_controller,
 )
 from ccd_casadi.extensions.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.extensions.explorer.known_plant import KnownPlant
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.reporting.machine import lumped
+from ccd_casadi.reporting.machine import find_lumped
 from ccd_casadi.sampling.inner_samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import hashes_of, problem_hash, sample_key, unit_of
-from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.terminal import Log
 from surrogates.files import write_whole
 
 
@@ -69,7 +69,7 @@ class Session:
         first = elements_at(problem, self.start.theta)
         self.slow = perf_counter() - began > SessionOptions.slow
         self.search_seconds = np.inf  # of the last full search
-        found = lumped(first.system)
+        found = find_lumped(first.system)
         self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
         self.known: KnownPlant | None = None
         if self.slow:
@@ -101,7 +101,7 @@ class Session:
         return present(problem, knobs, elements, (self.point[0], self.point[1]))
 
     def _held(self, problem: CoDesignProblem, knobs: Knobs) -> ExploredDesign:
-        problem = anchored(problem, self.designed_for)
+        problem = with_warm_starts_of(problem, self.designed_for)
         if self.kappa is None:
             elements = elements_at(problem, knobs.theta)
             words = "no controller yet: design one here"
@@ -124,7 +124,7 @@ class Session:
     def full(self, knobs: Knobs) -> ExploredDesign:
         """The inner problem at θ on the model itself."""
         problem = self.problems.at(knobs)
-        design = searched(problem, knobs, elements_at(problem, knobs.theta))
+        design = search_inner(problem, knobs, elements_at(problem, knobs.theta))
         self.search_seconds = design.seconds
         self.took(design)
         return design
@@ -176,25 +176,25 @@ class Session:
 
     def save(self, knobs: Knobs) -> Path:
         """The sliders as a case file, beside the store, under a number of its own."""
-        place = self._numbered("explored", ".toml")
+        place = self._number("explored", ".toml")
         write_whole(place, case_to_toml(case_at(self.case, knobs)))
         return place
 
     def folder_for_solve(self, knobs: Knobs) -> tuple[Path, Path]:
         """A new folder for a solve from the sliders' θ, and its case file."""
-        folder = self._numbered("solved", "")
+        folder = self._number("solved", "")
         folder.mkdir()
         place = folder / "from_here.toml"
         write_whole(place, case_to_toml(case_at(self.case, knobs)))
         return folder, place
 
-    def _numbered(self, name: str, suffix: str) -> Path:
+    def _number(self, name: str, suffix: str) -> Path:
         places = (self.folder / f"{name}_{number}{suffix}" for number in count(1))
         return next(place for place in places if not place.exists())
 
 
-def searched_exactly(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> tuple[ExploredDesign, str]:
+def search_exactly(task: tuple[CoDesignProblem, Knobs], log: Log) -> tuple[ExploredDesign, str]:
     """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
     problem, knobs = task
     elements = elements_at(problem, knobs.theta)
-    return searched(problem, knobs, elements), surface_modes_html(problem, knobs.theta)
+    return search_inner(problem, knobs, elements), surface_modes_html(problem, knobs.theta)

@@ -110,11 +110,11 @@ def _ended(found: "SetFeedforward") -> ExitCode:
 def _learn(run: "FinishedRun", folder: Path, log: Path) -> ExitCode:
     """Replace the coefficients in the folder by what a measured move has learned."""
     from ccd_casadi.cases.run_files import read_json
-    from ccd_casadi.extensions.feedforward.feedforward_files import improved, read_error, write_code
+    from ccd_casadi.extensions.feedforward.feedforward_files import improve, read_error, write_code
     from ccd_casadi.support.json_files import write_json
 
     before = read_json(folder / FILE)
-    after, words = improved(run, folder / FILE, before, read_error(log, before["period"]))
+    after, words = improve(run, folder / FILE, before, read_error(log, before["period"]))
     write_json(folder / FILE, after)
     write_code(folder, after)
     inform("\n".join(words))

@@ -15,7 +15,7 @@ from ccd_casadi.drawing.svg import BLUE, GREY
 from ccd_casadi.extensions.feedforward.move_responses import (
     MoveResponses,
     Shape,
-    learned,
+    learn,
     learning_gain,
     responses_of,
 )
@@ -25,7 +25,7 @@ from ccd_casadi.reporting.facts import run_name
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.text import counted, display_unit, spoken, template, with_unit
+from ccd_casadi.support.text import display_unit, plural, spoken, template, with_unit
 
 CODE = ("feedforward.h", "feedforward.c")
 OF_DESIGN = ("settled", "settled_model", "kept", "heat", "peak_force")  # unknown once it learns
@@ -72,12 +72,12 @@ def summary(found: SetFeedforward) -> list[str]:
         + ", ".join(f"{value:.4g}" for value in shape.split(found.found.x)[0])
     )  # fmt: skip
     judged = (
-        f"{found.kept} of {counted(len(found.judged), 'plant')} drawn from the set have settled "
+        f"{found.kept} of {plural(len(found.judged), 'plant')} drawn from the set have settled "
         f"by {1e3 * found.found.time:.4g} ms" if len(found.judged)
         else "not judged: the case has no set to draw plants from"
     )  # fmt: skip
     rows = {
-        "move": moved(found),
+        "move": move_words(found),
         "latest plant": f"{in_ms(found.latest)} with this feedforward, "
         f"{in_ms(found.latest_inverse)} with the model's inverse",
         "model": f"{in_ms(found.settled[0])}, {in_ms(found.settled_inverse[0])} with its inverse",
@@ -92,7 +92,7 @@ def summary(found: SetFeedforward) -> list[str]:
     return [f"{name:14s}{words}" for name, words in rows.items()]
 
 
-def moved(found: SetFeedforward) -> str:
+def move_words(found: SetFeedforward) -> str:
     """`10 mm in 180 ms, settled within ±1 µm`."""
     unit = spoken("m")
     far = with_unit(float(np.abs(found.responses[0].end).max()), unit)
@@ -159,7 +159,7 @@ def _require_rate(log: Path, time: Array, period: float) -> None:
         )
 
 
-def improved(
+def improve(
     run: FinishedRun, path: Path, before: Mapping[str, Any], error: Array
 ) -> tuple[dict[str, Any], list[str]]:
     """Coefficients after a move of the machine.
@@ -195,7 +195,7 @@ def improved(
                          samples=before["samples"])  # fmt: skip
     count, q = model.reached.shape[:2]
     if error.shape[1] != q:
-        words = f"{counted(error.shape[1], 'column')} of error; this plant has {q}"
+        words = f"{plural(error.shape[1], 'column')} of error; this plant has {q}"
         raise UserError(f"{path}: the log has {words}")
     if len(error) * model.period < profile.duration:
         raise UserError(f"{path}: the log ends before the setpoint; record longer")
@@ -205,8 +205,8 @@ def improved(
         raise UserError(f"{path}: {words}; give the error in {spoken('m')}")
     count = min(count, len(error))
     model = replace(model, reached=model.reached[:count])
-    shaped = model.shaped(shape)
-    x = learned(shape.joined(np.array(before["shaper"]), F), error[:count],
+    shaped = model.with_taps(shape)
+    x = learn(shape.join(np.array(before["shaper"]), F), error[:count],
                 learning_gain(shaped, shape), shape)  # fmt: skip
     rms, moves = float(np.sqrt(np.mean(error**2))), before["learned"] + 1
     new = {"forces": shape.split(x)[1].tolist(), "learned": moves} | dict.fromkeys(OF_DESIGN)
@@ -230,7 +230,7 @@ def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -
     good = found.kept == len(found.judged)
     drawn = f"{found.kept} of {len(found.judged)} plants drawn from the set settle in time"
     lead = (
-        f"A move of {moved(found)}: the latest plant of the set settles after "
+        f"A move of {move_words(found)}: the latest plant of the set settles after "
         f"{in_ms(found.latest)}; with the model's inverse as feedforward, "
         f"{in_ms(found.latest_inverse)}. The largest heat is "
         f"{100.0 * found.heat / found.limits.heat:.4g} %, and the largest force "

@@ -42,7 +42,7 @@ class LeastTimeOptions:
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """What the motors may do in a move."""
+    """The limits of the motors in a move."""
 
     peak: float  # u_max of any motor, N
     heat: float  # E, N² s
@@ -50,7 +50,7 @@ class ForceLimits:
 
 @dataclass(frozen=True)
 class LeastTime:
-    """What a search found."""
+    """The result of a search for the least time."""
 
     x: Array  # (c,) coefficients, as of `shape`
     shape: Shape
@@ -65,8 +65,8 @@ class _Programme:
         self, error: Array, force: Array, heat: Array, end: Array, shape: Shape, size: Array,
         window: float, options: LeastTimeOptions,
     ) -> None:  # fmt: skip
-        """Of `error` (plants, N, q, c), `end` (q,) and `window` over the move, `force` (plants, N,
-        m, c) and `heat` (plants, c, c), |R z| <= 1, over their limits."""
+        """Set up rows from `error` (plants, N, q, c), `end` (q,) and `window` over the move,
+        `force` (plants, N, m, c) and `heat` (plants, c, c), |R z| <= 1, over their limits."""
         plants, N, q, c = error.shape
         self.rows, self.right = error.reshape(-1, c) / window, np.tile(end, plants * N) / window
         self.sample = np.tile(np.repeat(np.arange(N), q), plants)
@@ -98,13 +98,13 @@ class _Programme:
             tangents = np.einsum("pi,pij->pj", heats[hot], self.heat[hot]) / lengths[hot, None]
             signed = np.sign(pushed[strong])[:, None] * self.motors[strong]
             self.limits = np.vstack([self.limits, signed, tangents])
-            found = self._solved(self.used[counts[self.used]])
+            found = self._solve(self.used[counts[self.used]])
             if found is None or found[1] > most:  # more rows do not lower s
                 break
             z, bound = found
         return np.inf, None
 
-    def _solved(self, used: np.ndarray) -> tuple[Array, float] | None:
+    def _solve(self, used: np.ndarray) -> tuple[Array, float] | None:
         """z and s of the rows in use."""
         rows, right = self.rows[used], self.right[used]
         slack = -np.ones((len(used), 1))
@@ -141,7 +141,7 @@ def least_time(
     be late enough, or where the search ends; `start` (c,) are coefficients whose largest errors are
     the first rows. None: not even by `latest`.
     """
-    shaped, period = [one.shaped(shape) for one in plants], plants[0].period
+    shaped, period = [one.with_taps(shape) for one in plants], plants[0].period
     move = float(np.abs(plants[0].end).max())
     error = np.array([one.reached for one in shaped]) / move
     force = np.array([one.force for one in shaped]) / limits.peak

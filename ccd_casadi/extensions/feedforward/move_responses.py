@@ -15,7 +15,7 @@ Learning: with the model's responses Ψ to the coefficients F of the feedforward
 
     F_{j+1} = F_j + Ψ⁺ e_j,        F_{j+1} - F* = (I - Ψ⁺ P)(F_j - F*)
 
-where P are the true responses and F* has Ψ⁺ e = 0: the least error that the model can tell from
+where P are the true responses and F* has Ψ⁺ e = 0: the least error that the model can reach from
 noise. It converges on a plant whose ρ = max |eig(I - Ψ⁺ P)| is less than 1, whatever the error is.
 
 Source: iterative learning with basis functions, van de Wijdeven and Bosgra, Int. J. Control 83
@@ -37,7 +37,7 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class Shape:
-    """Which coefficients there are."""
+    """The set of coefficients of shaper and feedforward."""
 
     orders: tuple[int, ...]  # derivatives of the setpoint that have a force
     forces: int  # m, of the plant
@@ -46,7 +46,7 @@ class Shape:
 
     @property
     def count(self) -> int:
-        """Number of coefficients."""
+        """The number of coefficients."""
         return self.taps * (1 + len(self.orders) * self.forces)
 
     @property
@@ -61,7 +61,7 @@ class Shape:
         F[:, self.orders] = rest.reshape(self.taps, len(self.orders), self.forces)
         return h, F
 
-    def joined(self, h: Array, F: Array) -> Array:
+    def join(self, h: Array, F: Array) -> Array:
         """x of h (taps,) and F (taps, 5, m); fewer taps are filled with zeros."""
         more = self.taps - len(h)
         h, F = np.append(h, np.zeros(more)), np.concatenate([F, np.zeros((more, *F.shape[1:]))])
@@ -79,15 +79,17 @@ class MoveResponses:
 
     @property
     def end(self) -> Array:
-        """Where the move ends (q,)."""
+        """The position where the move ends (q,)."""
         return np.asarray(self.setpoint[-1])
 
-    def shaped(self, shape: Shape) -> "MoveResponses":
-        """With all taps, coefficients in the order of `Shape`."""
-        return replace(self, reached=_tapped(self.reached, shape), force=_tapped(self.force, shape))
+    def with_taps(self, shape: Shape) -> "MoveResponses":
+        """Add all taps, with coefficients in the order of `Shape`."""
+        return replace(
+            self, reached=_add_taps(self.reached, shape), force=_add_taps(self.force, shape)
+        )
 
     def error(self, x: Array) -> Array:
-        """What is left to the end of the move (N, q)."""
+        """Compute what is left to the end of the move (N, q)."""
         return np.asarray(self.end - self.reached @ x)
 
     def tracking(self, x: Array, shape: Shape) -> Array:
@@ -96,9 +98,9 @@ class MoveResponses:
         wanted = [h[i] * _later(self.setpoint, i * shape.spacing) for i in range(shape.taps)]
         return np.asarray(sum(wanted) - self.reached @ x)
 
-    def settled(self, x: Array, window: float) -> float:
-        """From when on the error stays within `window`, s; infinite where it does not at last, and
-        where one is not finite."""
+    def settling_time(self, x: Array, window: float) -> float:
+        """Compute the time from which the error stays within `window`, s; infinite where it does
+        not at last, and where one is not finite."""
         error = np.abs(self.error(x)).max(axis=1)
         outside = np.flatnonzero(~(error <= window))
         if not outside.size:
@@ -115,7 +117,7 @@ class MoveResponses:
         return float(np.abs(self.force @ x).max())
 
 
-def _tapped(response: Array, shape: Shape) -> Array:
+def _add_taps(response: Array, shape: Shape) -> Array:
     """(N, q, taps c) of (N, q, c): taps of the setpoint, then tap by tap all forces."""
     later = [_later(response, shape.spacing * i) for i in range(shape.taps)]
     return np.concatenate([one[..., :1] for one in later] + [one[..., 1:] for one in later], axis=2)
@@ -172,7 +174,7 @@ def learning_gain(model: MoveResponses, shape: Shape) -> Array:
     return np.asarray(np.linalg.pinv(psi / size) / size[:, None])
 
 
-def learned(x: Array, error: Array, gain: Array, shape: Shape) -> Array:
+def learn(x: Array, error: Array, gain: Array, shape: Shape) -> Array:
     """Coefficients after a move with a controller's error (N, q), unit of y."""
     found = x.copy()
     found[shape.taps : shape.taps + len(gain)] += gain @ error.ravel()

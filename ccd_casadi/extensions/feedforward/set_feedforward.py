@@ -72,7 +72,7 @@ class SetFeedforward:
 
     @property
     def latest(self) -> float:
-        """When the last plant has settled, s; those that judge count too."""
+        """The time at which the last plant has settled, s; those that judge count too."""
         return float(max(self.settled.max(), self.judged.max(initial=0.0)))
 
     @property
@@ -82,7 +82,7 @@ class SetFeedforward:
 
     @property
     def kept(self) -> int:
-        """How many of the plants that judge have settled by the time of the design."""
+        """The number of judging plants that have settled by the time of the design."""
         return int((self.judged <= self.found.time).sum())
 
 
@@ -105,14 +105,14 @@ def set_feedforward(
     model, orders, inverse = _inverse(run, axis)
     plants = [model, *(member.plant.plant_si() for member in members(run, dense=True))]
     one, samples = Shape(orders, model.B.shape[1]), 0
-    x = one.joined(np.ones(1), inverse[None])
+    x = one.join(np.ones(1), inverse[None])
     respond = partial(_responses, run, profile=profile, orders=orders, axis=axis)
     least = window * (1.0 - LeastTimeOptions().margin)  # in which the inverse is a solution, too
     for doubling in range(options.doublings + 1):
         length = profile.duration * (1.0 + options.tail * 2.0**doubling)
         samples = int(np.ceil(length * _rate(run)))
         responses = respond(plants, samples=samples)
-        late = np.array([response.settled(x, least) for response in responses])
+        late = np.array([response.settling_time(x, least) for response in responses])
         if (late < 0.75 * length).all():  # no beat comes after it
             break
     limits = ForceLimits(max(item.peak(x) for item in responses),
@@ -123,7 +123,9 @@ def set_feedforward(
     )
     for i in range(options.rounds):
         more = respond(_drawn(run, options.drawn, [seed, 1 + i]), samples=samples)
-        times = np.array([one.shaped(found.shape).settled(found.x, window) for one in more])
+        times = np.array(
+            [one.with_taps(found.shape).settling_time(found.x, window) for one in more]
+        )
         worst = np.argsort(-times)[: options.added]
         worst = worst[times[worst] > found.time]
         if not worst.size:
@@ -133,10 +135,10 @@ def set_feedforward(
     judges = respond(_drawn(run, options.judges, [seed, 0]), samples=samples)
 
     def times_of(some: Sequence[MoveResponses], shape: Shape, x: Array) -> Array:
-        return np.array([each.shaped(shape).settled(x, window) for each in some])
+        return np.array([each.with_taps(shape).settling_time(x, window) for each in some])
 
-    shaped = [each.shaped(found.shape) for each in responses]
-    everyone = [*shaped, *(each.shaped(found.shape) for each in judges)]
+    shaped = [each.with_taps(found.shape) for each in responses]
+    everyone = [*shaped, *(each.with_taps(found.shape) for each in judges)]
     gain = learning_gain(shaped[0], found.shape)
     return SetFeedforward(
         found, x, profile, window, tuple(responses),
@@ -199,8 +201,8 @@ def _drawn_shifts(run: FinishedRun, count: int, seed: list[int]) -> list[StateSp
 def _shapes(
     run: FinishedRun, one: Shape, taps: int, samples: int, options: FeedforwardSetOptions
 ) -> list[Shape]:
-    """Without a shaper, and with the taps spread over parts of a period of the lowest resonance,
-    all of them within the samples."""
+    """List the shapes without a shaper, and with the taps spread over parts of a period of the
+    lowest resonance, all of them within the samples."""
     modal = run.modal()
     flexible = np.diag(modal.K)[modal.numbered]
     flexible = flexible[flexible > 0.0]
@@ -221,7 +223,7 @@ def _best(
     for shape in shapes:
         h, F = replace(shape, taps=1).split(inverse)
         end = latest if best is None else best.time * (1.0 - options.worth)
-        found = least_time(responses, shape, window, limits, end, shape.joined(h, F))
+        found = least_time(responses, shape, window, limits, end, shape.join(h, F))
         best = found or best
     if best is None:
         raise UserError(

@@ -139,7 +139,7 @@ def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], 
     sources["fmu.c"] = wrapper.replace("@GUID@", guid)
     K = realisation.system
     description = _description(K.B.shape[1], len(K.C), K.period, guid, title)
-    library = compiled(sources)
+    library = compile_library(sources)
     content: dict[str, bytes] = {"modelDescription.xml": description}
     content |= {f"sources/{name}": text.encode() for name, text in sources.items()}
     if library is not None:
@@ -153,7 +153,7 @@ def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], 
     return library is not None
 
 
-def compiled(sources: Mapping[str, str]) -> bytes | None:
+def compile_library(sources: Mapping[str, str]) -> bytes | None:
     """The shared library of the sources; None where this machine has no compiler for it."""
     command = shlex.split(os.environ.get("CC", "cc"))
     # FMI 2.0 has names for binaries of x86 alone

@@ -55,7 +55,7 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
     without_effect=["--workers", "--seed", "--no-user-code"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.extensions.imported.modal_table import write_modal_table
 
     folder: Path = options.run

@@ -45,12 +45,12 @@ class LeftOut:
 
     @property
     def frequency(self) -> float:
-        """The largest."""
+        """The largest error of a frequency."""
         return float(self.frequencies.max(initial=0.0))
 
     @property
     def response(self) -> float:
-        """The largest."""
+        """The largest error of a response."""
         return float(self.responses.max())
 
 
@@ -168,12 +168,12 @@ class InterpolatedModes:
             )
         self.table, self.rigid = table, int(counts[0])
         self.ratio = _common_ratio(table, self.rigid)
-        tried = map(self._fitted, frames(table, self.rigid))
+        tried = map(self._fit, frames(table, self.rigid))
         self.frame, entries, self.left_out = min(tried, key=lambda one: one[2].response)
         theta = ca.MX.sym("theta", len(table.names))
         y = entries(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
-        self.refusal = self._refused(*accepted)
+        self.refusal = self._worst_sample(*accepted)
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
@@ -199,7 +199,7 @@ class InterpolatedModes:
         distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
         return int(distance.argmin()), float(distance.min())
 
-    def _refused(self, frequency: float, response: float) -> str:
+    def _worst_sample(self, frequency: float, response: float) -> str:
         """The sample that is missed by most, over what is accepted, in words; else nothing."""
         table, errors = self.table, self.left_out
         worst = errors.frequencies.max(axis=1, initial=0.0) / frequency
@@ -233,7 +233,7 @@ class InterpolatedModes:
         beside[s] = False
         return np.asarray(0.5 * (theta[s] + theta[np.where(beside, errors, -np.inf).argmax()]))
 
-    def _fitted(self, frame: Frame) -> tuple[Frame, ca.Function, LeftOut]:
+    def _fit(self, frame: Frame) -> tuple[Frame, ca.Function, LeftOut]:
         """θ -> entries in the frame: ln K, ln D where it is not modal, B and C; and their error."""
         table, Q, flexible = self.table, frame.Q, slice(self.rigid, None)
         omega, own = table.omega[:, flexible], Q[:, flexible, flexible]

@@ -41,7 +41,7 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
             words = "its degrees of freedom are not those of the stiffness"
             raise PlantError(f"{folder / row['mass']}: {words}; write both of one step")
         at = rows if rows is not None else other
-        B, C = (_selected(folder, dofs, kind, M.shape[0], at) for kind in ("in", "out"))
+        B, C = (_select(folder, dofs, kind, M.shape[0], at) for kind in ("in", "out"))
         extra = np.hstack([B, C]) if static_correction else None
         omega, basis = modes_of(M, K, modes, extra)
         found.append((omega, basis.T @ B, basis.T @ C))
@@ -143,7 +143,7 @@ def _shape_values(
     """Shapes at the dofs named for it; else, on one mesh, at the `per_mode` times the number of
     modes rows that distinguish these best."""
     if any(row["kind"] == "shape" for row in dofs.values()):
-        return [own.T @ _selected(folder, dofs, "shape", len(own), at) for own, at in reduced]
+        return [own.T @ _select(folder, dofs, "shape", len(own), at) for own, at in reduced]
     bases = [basis for basis, _ in reduced]
     if len({len(basis) for basis in bases}) > 1:
         return [np.zeros((basis.shape[1], 0)) for basis in bases]
@@ -152,7 +152,7 @@ def _shape_values(
     return [basis[rows].T for basis in bases]
 
 
-def _selected(folder: Path, dofs: Rows, kind: str, size: int, at: NodeRows | None) -> Array:
+def _select(folder: Path, dofs: Rows, kind: str, size: int, at: NodeRows | None) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
     names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
@@ -222,13 +222,13 @@ def results_table(folder: Path) -> ModalTable:
     found = [read_modes(folder / row["results"]) for row in index.values()]
     kinds = ("in", "out", "shape")
     modes = [
-        (2.0 * np.pi * one.frequency_hz, *(_picked(dofs, kind, one) for kind in kinds))
+        (2.0 * np.pi * one.frequency_hz, *(_pick(dofs, kind, one) for kind in kinds))
         for one in found
     ]
     return table_of_samples(folder, index, dofs, modes)
 
 
-def _picked(dofs: Rows, kind: str, modes: ResultModes) -> Array:
+def _pick(dofs: Rows, kind: str, modes: ResultModes) -> Array:
     """(r, k) displacement along each name of this kind."""
     names = list(dict.fromkeys(row["name"] for row in dofs.values() if row["kind"] == kind))
     found = np.zeros((len(modes.frequency_hz), len(names)))

@@ -12,7 +12,7 @@ from scipy.io import loadmat, mmread
 from scipy.sparse import coo_array, csc_array, issparse, triu
 from scipy.sparse import load_npz as load_sparse
 
-from ccd_casadi.support.errors import PlantError, UserError, described, require
+from ccd_casadi.support.errors import PlantError, UserError, describe, require
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 NodeRows = Mapping[tuple[int, str], int]  # (node, direction) -> row, where a file names nodes
@@ -51,7 +51,7 @@ def read_matrix(
     except (PlantError, UserError):
         raise
     except Exception as error:  # whatever a reader makes of a damaged or foreign file
-        words = " ".join(described(error).split())[:200]
+        words = " ".join(describe(error).split())[:200]
         raise PlantError(f"{path}: cannot be read: {words}; save the matrix again") from None
     if np.iscomplexobj(value):
         raise PlantError(f"{path}: is not a real matrix; save it without structural damping")

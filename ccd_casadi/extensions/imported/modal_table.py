@@ -102,9 +102,9 @@ def read_modal_table(path: Path) -> ModalTable:
     columns = [of_sample(name) for name in groups["constraint:"]]
     return ModalTable(
         names=tuple(theta_names),
-        input_names=_stripped(groups["in:"]),
-        output_names=_stripped(groups["out:"]),
-        constraint_names=_stripped(groups["constraint:"]),
+        input_names=_strip(groups["in:"]),
+        output_names=_strip(groups["out:"]),
+        constraint_names=_strip(groups["constraint:"]),
         theta=np.array(list(samples)),
         omega=2.0 * np.pi * at["frequency_hz"],
         zeta=at["damping"],
@@ -155,7 +155,7 @@ def _mode(place: str, cells: dict[str, str]) -> dict[str, float]:
     return row
 
 
-def _stripped(names: Sequence[str]) -> tuple[str, ...]:
+def _strip(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.split(":", 1)[1] for name in names)
 
 
@@ -229,7 +229,7 @@ def frames(table: ModalTable, rigid: int, *, options: FrameOptions = FrameOption
     shapes = np.concatenate([table.inputs, table.outputs, table.shapes], axis=2)
     order, parents = _tree(table.theta)
     ordered = np.tile(np.arange(count), (len(table.theta), 1))
-    matched = _matched(table, shapes, order, parents, rigid, options.frequency_weight)
+    matched = _match(table, shapes, order, parents, rigid, options.frequency_weight)
     free: Groups = (tuple(range(rigid)),) if rigid else ()
     single: Groups = tuple((i,) for i in range(rigid, count))
     name, tie = "modes in order of frequency", options.tie
@@ -253,7 +253,7 @@ def _tree(theta: Array) -> tuple[Index, Index]:
     return order.astype(np.int64), parents.astype(np.int64)
 
 
-def _matched(
+def _match(
     table: ModalTable, shapes: Array, order: Index, parents: Index, rigid: int, weight: float
 ) -> Index:
     """(N, r) which mode of each sample is the reference's i-th; flexible modes only move."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccd_casadi.extensions.imported.matrix_files import DIRECTIONS
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError, UserError, described, require
+from ccd_casadi.support.errors import PlantError, UserError, describe, require
 from ccd_casadi.support.text import HZ
 
 _VALUE = re.compile(r"[-+]?\d*\.\d+(?:[EeDd]?[-+]\d+)?")
@@ -19,7 +19,7 @@ _VECTOR = re.compile(r"R E A L   E I G E N V E C T O R   N O \.\s+(\d+)")
 
 
 class ReadModes(NamedTuple):
-    """As a file has them: Hz, modal masses, and displacements (6,) at nodes, mode by mode."""
+    """The modes of a file: Hz, modal masses, and displacements (6,) at nodes, mode by mode."""
 
     hz: list[float]
     masses: list[float]
@@ -61,7 +61,7 @@ def read_modes(path: Path) -> ResultModes:
     except (PlantError, UserError):
         raise
     except Exception as error:  # a damaged file fails anywhere inside a reader
-        words = " ".join(described(error).split())[:200]
+        words = " ".join(describe(error).split())[:200]
         cause = f"is damaged, or not as {form.program} writes it: {words}"
         raise PlantError(f"{path}: {cause}; run the analysis again") from None
     counts = {len(vector) for vector in vectors}
@@ -123,7 +123,8 @@ def _require_positive(path: Path, eigenvalues: Array, *, rigid_hz: float = 0.1) 
 
 
 def _by_node(values: Array, nodes: Array, directions: Array) -> list[dict[int, Array]]:
-    """Of modes (r, k): displacements (6,) of each node; other degrees of freedom are left out."""
+    """Sort modes (r, k) by node: displacements (6,) of each; other degrees of freedom are left
+    out."""
     found: list[dict[int, Array]] = []
     kept = (directions >= 0) & (directions < len(DIRECTIONS))
     names, place = np.unique(nodes[kept], return_inverse=True)

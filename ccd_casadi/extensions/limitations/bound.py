@@ -188,8 +188,8 @@ def upper_bound(
     if not met:
         search = _Search(limits, begin, -1, options)
         omega_b = _where(search.multiplier, begin, most, aim, options)[0]
-    found = _certified(limits, omega_b, most, options.coarse, options) if met else 0.0
-    found = found or _certified(limits, omega_b, most, options.fine, options)
+    found = _certify(limits, omega_b, most, options.coarse, options) if met else 0.0
+    found = found or _certify(limits, omega_b, most, options.fine, options)
     return min(found or most, known)
 
 
@@ -210,7 +210,7 @@ def forbids(
     return bool(1.0 < g < np.inf) and rules_out(limits, search.basis, weight, omega_b, grid)
 
 
-def _certified(
+def _certify(
     limits: Limits, omega_b: float, most: float, size: tuple[int, int], options: BoundOptions
 ) -> float:
     """The least ω_b that a certificate was found for, next to `omega_b`; 0: none below `most`.
@@ -243,7 +243,7 @@ def forbids_most(candidates: Sequence[Limits], options: BoundOptions = BoundOpti
 
 
 def _first(limits: Limits, most: float, options: BoundOptions) -> float:
-    """Where a search begins, rad/s; infinite where nothing says."""
+    """Return where a search begins, rad/s; infinite where nothing is known."""
     zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
     return min([options.first * most, *zeros])
 

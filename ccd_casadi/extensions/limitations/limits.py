@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.lti.loop import Sampling, sampled
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.loop import Sampling, zoh
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -30,7 +30,7 @@ class Response:
     value: complex
 
     def values(self, v: Array) -> np.ndarray:
-        """g(jv)."""
+        """Compute g(jv)."""
         found = np.full(v.shape, complex(self.value))
         for roots, sign in ((self.zeros, 1), (self.poles, -1)):
             for r in roots:
@@ -59,17 +59,18 @@ class Response:
 
 
 def response_of(system: StateSpace) -> Response | None:
-    """Of one input and output, continuous or sampled; there in v, delays as zeros at 2/T.
+    """Compute the response of one input and output, continuous or sampled; there in v, delays as
+    zeros at 2/T.
 
     None where the input does not reach the output, as between axes that are apart.
 
     Raises PlantError where poles and zeros do not give the response.
     """
     T = system.period
-    on = _reached(system.A, system.B) & _reached(system.A.T, system.C.T)
+    on = _find_reached(system.A, system.B) & _find_reached(system.A.T, system.C.T)
     if not on.any():
         return None
-    even = balanced(
+    even = balance_system(
         system.A[on][:, on], system.B[on], system.C[:, on]
     )  # or its zeros have errors of 1e-3
     system = StateSpace(*even, system.D, period=T)
@@ -95,13 +96,13 @@ def response_of(system: StateSpace) -> Response | None:
 
 
 def _resting(poles: np.ndarray, at_rest: float = 1e-6) -> np.ndarray:
-    """Which poles (s, or v of a sampled plant) are of free bodies: `at_rest` of the fastest."""
+    """Find the poles (s, or v of a sampled plant) of free bodies: `at_rest` of the fastest."""
     size = np.abs(poles)
     return np.asarray(size <= at_rest * size.max(initial=0.0))
 
 
-def _reached(A: Array, B: Array) -> np.ndarray:
-    """Which states the inputs reach through entries that are not zero."""
+def _find_reached(A: Array, B: Array) -> np.ndarray:
+    """Find the states that the inputs reach through entries that are not zero."""
     found = np.asarray(B.any(axis=1))
     for _ in A:
         found = found | A[:, found].any(axis=1)
@@ -133,7 +134,7 @@ class Limits:
     unstable: tuple[complex, ...] = ()
 
     def omega(self, v: Array) -> Array:
-        """ω in rad/s."""
+        """Return ω in rad/s."""
         T = self.period
         return np.asarray(2.0 / T * np.arctan(0.5 * T * v)) if T else v
 
@@ -185,7 +186,7 @@ def limits_of(
     integrator: bool = True,
     outside: float = 1e-3,
 ) -> Limits:
-    """Of a SI plant in a direction of outputs (one output: None).
+    """Find the limits of a SI plant in a direction of outputs (one output: None).
 
     `bounds` are its own. Free bodies and unstable poles make S vanish there; what is used here, T
     analytic with zeros of G, holds with them too. A root whose real part is `outside` of its size
@@ -194,7 +195,7 @@ def limits_of(
     if sampling is None:
         held, period = plant, 0.0
     else:
-        held, period = sampled(plant, sampling.period, sampling.delay), sampling.period
+        held, period = zoh(plant, sampling.period, sampling.delay), sampling.period
     u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
     parts = (
         response_of(
@@ -259,7 +260,8 @@ def ratio(one: Response, other: Response, low: Array, high: Array) -> tuple[np.n
 
 
 def circle(r: np.ndarray, m: Array) -> tuple[np.ndarray, Array]:
-    """Of |1 - T| <= m |1 + (r - 1) T|; an infinite radius where that is not the inside of one."""
+    """Compute the circle |1 - T| <= m |1 + (r - 1) T|; an infinite radius where that is not the
+    inside of one."""
     square = 1.0 - (m * np.abs(r - 1.0)) ** 2
     inside = square > 0.0
     square = np.where(inside, square, 1.0)

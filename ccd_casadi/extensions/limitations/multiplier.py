@@ -98,8 +98,8 @@ SOLVED = ("Solved", "AlmostSolved")
 
 
 def that_matter(centres: np.ndarray, radii: Array, almost: float = 0.01) -> np.ndarray:
-    """Which of the discs (k, N): the first two, and others that no disc is in, or all but `almost`
-    of their radius."""
+    """Select of the discs (k, N) the first two, and others that no disc contains, or all but
+    `almost` of their radius."""
     found = np.ones(radii.shape, bool)
     for i in range(2, len(radii)):
         for j in range(len(radii)):
@@ -120,7 +120,7 @@ def least_scaling(functions: np.ndarray, centres: np.ndarray, radii: Array) -> t
     rows[:, 1, :n], rows[:, 2, :n] = functions.real / size, functions.imag / size
     right[:, 1:] = np.array([c.real, c.imag]).T / size
     aim = np.append(np.zeros(n), 1.0)
-    x = _solved(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), 0, 0)
+    x = _solve(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), 0, 0)
     return (np.inf, np.zeros(n)) if x is None else (float(x[-1]), x[:n])
 
 
@@ -154,11 +154,11 @@ def greatest_multiplier(
     order = [[0], 1 + threes[0], 1 + 3 * N + threes[1], np.arange(end, end + n + 1)]
     rows, right = rows[np.concatenate(order)].tocsc(), np.append(1.0, np.zeros(end + n))
     aim = np.concatenate([np.zeros(n), -c.real, c.imag, np.zeros(N + E), [cost]])
-    x = _solved(aim, rows, right, 1, n + 1)
+    x = _solve(aim, rows, right, 1, n + 1)
     return (np.inf, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])
 
 
-def _solved(
+def _solve(
     aim: Array, rows: sparse.csc_matrix, right: Array, linear: int, last: int
 ) -> Array | None:
     """min aim·x where right - rows x is >= 0 in its `linear` first rows, then in cones of three,

@@ -46,7 +46,7 @@ class BandwidthGap:
     limits: tuple[str, ...] = ()  # what unstable poles and zeros do to every loop, in words
 
     def finding(self, bandwidth: float) -> Finding:
-        """Of the verdict, with a design's ω_b in rad/s."""
+        """Make the finding of the verdict, with a design's ω_b in rad/s."""
         if not np.isfinite(self.upper_bound):
             return Reason.NO_GAP()
         gap = self.upper_bound / bandwidth - 1.0
@@ -54,7 +54,8 @@ class BandwidthGap:
         return Reason.GAP(bandwidth_bound_hz=bound, plants=self.plants, relative=gap)
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
-        """Of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1; null: not known.
+        """Write the entry of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1;
+        null: not known.
 
         `objective_bound`, of J over θ, is not known yet.
         """
@@ -108,7 +109,7 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
 
 def of_counted_sensor(plant: StateSpace, bounds: Bounds, sampling: Sampling | None,
                       integrator: bool) -> Limits:  # fmt: skip
-    """Of several sensors on one actuator, the loop of the one whose error counts.
+    """Find the limits of the loop of the sensor whose error counts, of several on one actuator.
 
         1 - uᵀS r = uᵀG q,   q = K S r,   uᵀr = 1
 
@@ -123,7 +124,7 @@ def of_counted_sensor(plant: StateSpace, bounds: Bounds, sampling: Sampling | No
 
 
 def classic_limits(limits: Limits) -> tuple[str, ...]:
-    """What holds for every controller of one channel, in words with figures; z and p in v.
+    """Describe what holds for every controller of one channel, with figures; z and p in v.
 
         S(z) = 1, S(p) = 0:   ‖S‖∞ >= Π_p |z + p̄|/|z - p|
         T(p) = 1, T(z) = 0:   ‖T‖∞ >= Π_z |p + z̄|/|p - z|,   ‖S‖∞ >= ‖T‖∞ - 1
@@ -160,7 +161,8 @@ def classic_limits(limits: Limits) -> tuple[str, ...]:
 def opposite_corners(
     uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling | None, integrator: bool
 ) -> list[Limits]:
-    """Of one input and output: each corner of the box with the least damping, and the one opposite.
+    """List the limits at each corner of the box with the least damping, and at the one opposite;
+    one input and output.
 
     One controller serves both, so that both plants' bounds count; T is the first one's.
     """

@@ -53,7 +53,7 @@ EXTENSION = Extension(
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
-    from ccd_casadi.deployment.realisation import realised
+    from ccd_casadi.deployment.realisation import realise_blocks
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.extensions.measured.measured_answer import answer_of, measured_page
@@ -103,7 +103,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         write_json(folder / "controller.json", answer.controller)
         write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
-            write_c(folder, realised(tustin(K, case.period)), title=case.file, delay=options.delay,
+            coded = realise_blocks(tustin(K, case.period))
+            write_c(folder, coded, title=case.file, delay=options.delay,
                     verified=found.design.usable, kind=FixedStructure.title)  # fmt: skip
         lines = [
             *now,

@@ -48,7 +48,7 @@ class LinePlants(PlantSet):
 
     @cached_property
     def modes(self) -> modes.Plants:
-        """As the kernels have them."""
+        """The modes in the form of the kernels."""
         p, r = self.poles, self.residues
         residues = np.stack([r.real, r.imag], axis=2)
         if self.period is None:
@@ -125,7 +125,7 @@ class LineProblem(LoopProblem):
         return found if self.effort is None or LoopCurve.KS in found else (*found, LoopCurve.KS)
 
     def loop(self, kappa: Array, tau: float) -> LoopArrays:
-        """With the bound of |KS| at this ω_b."""
+        """Return the loop with the bound of |KS| at this ω_b."""
         loop = super().loop(kappa, tau)
         loop.limits[LoopCurve.KS, : self.first] = np.minimum(
             loop.limits[LoopCurve.KS, : self.first], self.ceiling(tau)[0]
@@ -321,7 +321,7 @@ def _ends(
 
 @hessians.register
 def _(problem: LineProblem, kappa: Array, tau: float, constraints: Constraints) -> Array:
-    """At fixed lines."""
+    """Compute the Hessians at fixed lines."""
     n = len(kappa)
     out = np.zeros((len(constraints.v), n + 1, n + 1))
     number, i = np.divmod(constraints.plant, problem.plants.count)

@@ -20,16 +20,21 @@ from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import facts
-from ccd_casadi.reporting.gain_figures import bandwidth_level, forbidden, over_hz, sensitivity_panel
+from ccd_casadi.reporting.gain_figures import (
+    bandwidth_level,
+    forbidden_gains,
+    over_hz,
+    sensitivity_panel,
+)
 from ccd_casadi.reporting.limit_figures import controller_blocks
 from ccd_casadi.reporting.nyquist import drawable, nyquist_panel
 from ccd_casadi.reporting.run_verdict import head_of
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, number, spoken
 
 
 def measured_answer(
-    case: MeasuredCase, *, seed: int, tell: Tell = silent
+    case: MeasuredCase, *, seed: int, log: Log = silent
 ) -> tuple[InnerAnswer, MeasuredDesign]:
     """Design the structure of a case on its measured lines.
 
@@ -38,7 +43,7 @@ def measured_answer(
     case : MeasuredCase
     seed : int
         Of the multi-start search.
-    tell : callable
+    log : callable
         Takes lines of progress.
 
     Returns
@@ -47,7 +52,7 @@ def measured_answer(
     """
     made = design_on_data(
         case.responses, case.structure, case.bounds, period=case.period, starts=case.starts,
-        seed=seed, progress=tell,
+        seed=seed, progress=log,
     )  # fmt: skip
     return answer_of(case, made), made
 
@@ -175,7 +180,8 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
             legend=None, y_range=(0.5 * float(size.min()), top),
-            forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
+            forbidden=forbidden_gains(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends,
+                                      top)),
          nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
         (over_hz(spoken("|G| (m/N)"), curves["G"], ends),
          over_hz("|L| (–)", curves["L"], ends, levels=(c.Level(1.0, "1"), at))),

@@ -24,7 +24,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, Decou
 from ccd_casadi.fixed_structure.design import DesignOptions, in_problem_units
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
-from ccd_casadi.fixed_structure.multi_start import finished, search_from_starts
+from ccd_casadi.fixed_structure.multi_start import finish, search_from_starts
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
@@ -32,7 +32,7 @@ from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent, titled
+from ccd_casadi.support.terminal import Log, silent, with_title
 from ccd_casadi.support.text import HZ
 
 NEGATIVE = "K has a negative gain, by the sign of the plant's"
@@ -73,7 +73,7 @@ def design_on_data(
     effort: float | None = None,
     given_up: float = 0.0,
     initial: Array | None = None,
-    progress: Tell = silent,
+    progress: Log = silent,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
     """Maximise ω_b over the parameters of a structure, with every bound on every measured line.
@@ -138,17 +138,17 @@ def design_on_data(
         words = NO_START if all(one.modelled for one in responses) else NO_START + OF_DATA
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, words, spent, sign)
     best: MeasuredDesign | None = None
-    for runner in finished(search_from_starts(problem, np.array(pool), progress, workers)):
+    for runner in finish(search_from_starts(problem, np.array(pool), progress, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
         spent += runner.evaluations + end.evaluations
         kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
-        design = _judged(problem, kappa, period, spent)
+        design = _judge(problem, kappa, period, spent)
         if best is None or design.usable:
             best = design
         if best.usable:
             break
     assert best is not None
-    return best if sign > 0.0 else _turned(best)
+    return best if sign > 0.0 else _turn_sign(best)
 
 
 def _require_known_gain(measured: MeasuredResponse) -> None:
@@ -168,8 +168,8 @@ def _require_known_gain(measured: MeasuredResponse) -> None:
 
 
 def _sign(responses: Sequence[MeasuredResponse]) -> float:
-    """Of K: with an integrator the closed loop's characteristic polynomial has at 0 the sign of
-    K G there times -1 for each unstable pole, and has to be positive."""
+    """Return the sign of K: with an integrator the closed loop's characteristic polynomial has at 0
+    the sign of K G there times -1 for each unstable pole, and has to be positive."""
     signs = {float(np.sign(one.static[0, 0])) * (-1.0) ** one.unstable_poles for one in responses}
     if len(signs - {0.0}) > 1:
         words = "the plants have gains of both signs, which no controller with an integrator holds"
@@ -177,8 +177,8 @@ def _sign(responses: Sequence[MeasuredResponse]) -> float:
     return -1.0 if -1.0 in signs else 1.0
 
 
-def _turned(design: MeasuredDesign) -> MeasuredDesign:
-    """With the other sign of K."""
+def _turn_sign(design: MeasuredDesign) -> MeasuredDesign:
+    """Turn the sign of K."""
     K, words = design.controller, f"{design.words}; {NEGATIVE}"
     if K is not None:
         K = replace(K, C=-K.C, D=-K.D)
@@ -193,7 +193,7 @@ def _more_integral(problem: LineProblem, point: Point, share: float) -> Array:
     parts = [name.endswith(("gain", "integrator")) for name in problem.structure.names]
     slope, floor = -np.array(parts, float), point.tau + float(np.log(1.0 - share))
     model = LoopModel(problem, lambda kappa: (float(slope @ kappa), slope), 0.0, floor)
-    begin = model.assessed(point.kappa, point.tau, point.assessment)
+    begin = model.make_iterate(point.kappa, point.tau, point.assessment)
     if begin is None:
         return point.kappa
     end, _ = descend(model, begin, np.zeros(2 * begin.x.shape), problem.margin)
@@ -213,11 +213,11 @@ def static_decoupling(measured: MeasuredResponse) -> Decoupling:
     return Decoupling(names, U, Vt.T)
 
 
-def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int) -> MeasuredDesign:
+def _judge(problem: LineProblem, kappa: Array, period: float | None, spent: int) -> MeasuredDesign:
     """The controller at κ with the judge's figures, which may exceed a bound by 1e-5 (rounding)."""
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
-    K = structure.state_space(si).balanced()
+    K = structure.state_space(si).balance()
     figures = judge(problem.responses, K, bounds, period=period, integrator=structure.integrator)
     shares = bounds.shares(figures).items()
     broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
@@ -253,7 +253,7 @@ def _channels_stacked(
     period: float | None,
     starts: int,
     seed: int,
-    tell: Tell,
+    log: Log,
     workers: Pool | None,
     lines: int = 600,
 ) -> tuple[list[Array], int]:
@@ -270,7 +270,7 @@ def _channels_stacked(
             name = structure.decoupling.names[i]
             design = design_on_data(
                 entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,
-                effort=problem.effort, progress=titled(tell, f"channel {name}"), workers=workers,
+                effort=problem.effort, progress=with_title(log, f"channel {name}"), workers=workers,
             )  # fmt: skip
             spent += design.steps
             parts.append(design.kappa)

@@ -159,7 +159,8 @@ def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
 
 
 def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: list[str]) -> str:
-    """What of a resonance between two lines is assumed; a doubt where the lines do not show it."""
+    """State what is assumed of a resonance between two lines; a doubt where the lines do not show
+    it."""
     if measured.modelled:
         return "a model is behind the lines"
     hz, most, least = measured.hz, hidden_damping(measured, L, k), measured.least_damping
@@ -223,7 +224,7 @@ def winding(
 
 
 def _turns(measured: MeasuredResponse, F: np.ndarray) -> Array:
-    """How far the angle of F (k,) grows from line to line.
+    """Compute how far the angle of F (k,) grows from line to line.
 
     Past a pole on the axis F ~ a + b/(ω - ω₀): out along b, half a turn back (the contour passes
     right of the pole, which then counts as stable), and in again.

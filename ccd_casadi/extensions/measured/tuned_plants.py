@@ -11,13 +11,13 @@ from ccd_casadi.deployment.given_controller import read_controller
 from ccd_casadi.extensions.measured.measured_loop import judge
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.frequency_grid import RootOptions, frequency_grid, root_flanks
-from ccd_casadi.lti.loop import delay_parts, delayed, sampled
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.loop import delay_parts, with_delays, zoh
+from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.plants.response_table import lines_in
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
-from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.terminal import Log
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
 from ccd_casadi.synthesis.matlab_systems import bare
@@ -43,11 +43,11 @@ class LineOptions:
     halvings: int = 6  # lines added on each side, each at half the distance of the one before
 
 
-def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
+def read_plant(item: Any, delay: float, log: Log) -> tuple[Plant, float]:
     """A plant as it was given, and what it is behind in s."""
     if isinstance(item, str | Path):
         name, item = Path(item).name, _of_file(Path(item))
-        tell(f"{name}: {item.words}")
+        log(f"{name}: {item.words}")
     elif hasattr(item, "frdata"):
         item = from_control(item)
     if isinstance(item, MeasuredResponse):
@@ -56,7 +56,7 @@ def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
         return item.system, delay + item.delay
     found = interchange.from_control(item)
     if not found.period and appears_discrete(found.A):  # 0 is the default of dt
-        tell(f"warning: {HINT}; give dt in s, or convert with d2c")
+        log(f"warning: {HINT}; give dt in s, or convert with d2c")
     return found, delay
 
 
@@ -83,7 +83,7 @@ def as_lines(
         raise UserError("the plant has feedthrough; give it the lag of its sensor or actuator")
     T = 1.0 / rate_hz
     if not own:
-        model = sampled(system, T, delay)
+        model = zoh(system, T, delay)
     elif not np.isclose(own, T):
         words = f"the plant is sampled at {1.0 / own:.6g} Hz and the controller at {rate_hz:.6g} Hz"
         raise UserError(f"{words}; give the plant's rate (--rate-hz) or the continuous plant")
@@ -92,7 +92,7 @@ def as_lines(
         raise UserError(f"{words} is sampled; give whole periods (--delay) or the continuous plant")
     else:
         whole = delay_parts(T, delay)[0]
-        model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
+        model = with_delays(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
     _require_seen(system, options)
     top, rates = np.pi / T, system.rates
     rest = np.abs(rates) <= options.at_rest * np.abs(rates).max(initial=0.0)
@@ -101,9 +101,9 @@ def as_lines(
         raise UserError("the plant has a zero at 0: no controller holds its output at rest")
     roots = np.concatenate([rates[~rest], zeros, [top]])
     low = options.lowest * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
-    roots = _folded(roots, T)
+    roots = _fold(roots, T)
     undamped = np.abs(rates.real) <= options.on_axis * np.abs(rates)
-    axis = _folded(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
+    axis = _fold(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
     narrow = np.abs(roots.real) <= options.on_axis * np.abs(roots)
     widened = options.half_width * np.abs(roots[narrow]) + 1j * roots[narrow].imag
     beside = root_flanks(widened, [x for x in RootOptions.flanks if x])
@@ -133,7 +133,7 @@ def _require_short(item: Plant, rate_hz: float | None, delay: float, options: Li
         raise UserError(f"{words}: is it in microseconds? give it in s")
 
 
-def _folded(rates: np.ndarray, T: float) -> np.ndarray:
+def _fold(rates: np.ndarray, T: float) -> np.ndarray:
     """Rates in 1/s with their frequencies where a sampled system has them, up to half the rate."""
     turns = np.abs(rates.imag) * T
     return np.asarray(
@@ -145,7 +145,7 @@ def _require_seen(system: StateSpace, options: LineOptions) -> None:
     """Raises UserError where a mode that is not stable is not driven or not measured: Hautus."""
     if not system.B.any() or not system.C.any():
         raise UserError("the plant is 0: no input moves what is measured")
-    A, B, C = balanced(system.A, system.B, system.C)
+    A, B, C = balance_system(system.A, system.B, system.C)
     size = np.linalg.norm(A, 2) or 1.0
     parts = {"driven by no input": (B * (size / np.linalg.norm(B, 2)), 1),
              "seen at no output": (C * (size / np.linalg.norm(C, 2)), 0)}  # fmt: skip
@@ -183,7 +183,7 @@ def with_lines_near(
     *,
     options: LineOptions = LineOptions(),
 ) -> MeasuredResponse:
-    """With lines where |S| was too large between two, or the bandwidth ends, and nearby."""
+    """Add lines where |S| was too large between two, or the bandwidth ends, and nearby."""
     # Closer by halves: what is narrow beside a light resonance of the plant moves with each design.
     offsets = options.nearby * 0.5 ** np.arange(options.halvings)
     nearby = np.concatenate([1.0 - offsets, [1.0], 1.0 + offsets])
@@ -206,7 +206,7 @@ class PresentLoop:
 
     @property
     def words(self) -> str:
-        """In words."""
+        """The present loop in words."""
         if not self.stable:
             return "now not stable by its winding on these lines: is its sign e = r - y to force?"
         peak = f"|S| at most {self.peak:.4g} at {self.peak_hz:.4g} Hz"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.deployment.realisation import realise_blocks
 from ccd_casadi.extensions.measured.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.extensions.measured.measured_loop import bandwidth_within
 from ccd_casadi.extensions.measured.tuned_plants import (
@@ -27,13 +27,13 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import HALF_POWER
-from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_flanks, zoomed
+from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_flanks, zoom
 from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, use_units
 from ccd_casadi.support.worker_process import one_blas_thread
 
@@ -57,7 +57,7 @@ NOT_JUDGED = Judgement(0, {}, None, "no usable controller was found to judge")
 
 @dataclass(frozen=True, repr=False)
 class Tuned:
-    """A tuned controller.
+    """A tuned controller and its judgement.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def tune(
     spread: float = 1.0,
     starts: int = 24,
     seed: int = 0,
-    progress: Tell | None = None,
+    progress: Log | None = None,
     workers: Pool | None = None,
     options: TuningOptions = TuningOptions(),
 ) -> Tuned:
@@ -165,11 +165,11 @@ def tune(
     for key, value in (("rate_hz", rate_hz), ("effort", effort)):
         if value is not None and not 0.0 < value < np.inf:
             raise UserError(f"{key}: is {value:.6g}; give a number above 0")
-    tell = progress or silent
+    log = progress or silent
     own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
            "least_damping": least_damping}  # fmt: skip
     stated = [name for name, value in own.items() if value is not None]
-    known = [read_plant(item, delay, tell) for item in given]
+    known = [read_plant(item, delay, log) for item in given]
     if stated and all(isinstance(item, StateSpace) for item, _ in known):
         words = f"{', '.join(stated)}: is of measured plants, and of a model its poles are known"
         raise UserError(f"{words}; drop it")
@@ -202,7 +202,7 @@ def tune(
         aim = replace(bounds, S_max=S_max - inside)
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
                                 effort=effort, given_up=options.given_up, initial=initial,
-                                progress=tell, workers=workers)  # fmt: skip
+                                progress=log, workers=workers)  # fmt: skip
         if not periods:
             break
         loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
@@ -228,9 +228,9 @@ def tune(
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
     judge, K = NOT_JUDGED, design.controller
     if design.usable and K is not None:
-        coded = K if period is None else realised(tustin(K, period)).as_coded
+        coded = K if period is None else realise_blocks(tustin(K, period)).as_coded
         judge = judgement.together([
-            judgement.attempted(_judged, plant, late, K, coded, bounds, design.bandwidth,
+            judgement.attempt_judgement(_judge, plant, late, K, coded, bounds, design.bandwidth,
                                 structure.integrator)
             for plant, late in known
         ])  # fmt: skip
@@ -239,11 +239,11 @@ def tune(
     return Tuned(case, design, models, norms, judge)
 
 
-def _judged(
+def _judge(
     plant: Plant, delay: float, K: StateSpace, coded: StateSpace, bounds: Bounds, bandwidth: float,
     integrator: bool,
 ) -> Judgement:  # fmt: skip
-    """What runs on a plant as it was read."""
+    """Judge the code that runs on a plant as it was read."""
     if isinstance(plant, StateSpace):
         hold = Sampling(1.0 / coded.period, 1e6 * delay)
         return judgement.judge_loops([plant], K, coded, bounds, hold, bandwidth, integrator)
@@ -293,7 +293,7 @@ def _loop_on(
     omega = frequency_grid(low, top, count, root_flanks(roots), apart=LineOptions.apart)
 
     def level(omega: np.ndarray) -> np.ndarray:
-        return np.log(sigma_max(S.swept(omega.ravel()))).reshape(omega.shape)
+        return np.log(sigma_max(S.sweep(omega.ravel()))).reshape(omega.shape)
 
     def held(omega: np.ndarray) -> np.ndarray:
         """-ln of the ω_b that the shape allows."""
@@ -304,7 +304,7 @@ def _loop_on(
     for curve in (level, held):
         top_at = local_maxima(curve(omega))
         ends = omega[top_at - 1], omega[top_at + 1]
-        omega = np.union1d(omega, zoomed(curve, *ends)[0])
+        omega = np.union1d(omega, zoom(curve, *ends)[0])
     curve_S = level(omega)
     tops = local_maxima(curve_S)
     over = omega[tops[curve_S[tops] > np.log(bounds.S_max)]]

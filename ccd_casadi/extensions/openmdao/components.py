@@ -28,7 +28,7 @@ class _Component(om.ExplicitComponent):
     def initialize(self) -> None:
         self.options.declare("problem", types=CoDesignProblem, desc="as `problem_of` makes it")
 
-    def declared(self, x: ca.MX, controlled: Mapping[str, ca.MX], units: Mapping[str, str]) -> None:
+    def declare(self, x: ca.MX, controlled: Mapping[str, ca.MX], units: Mapping[str, str]) -> None:
         """Inputs θ, and ln ω_S and ln ω_T where x has them; outputs `controlled`, f and λ."""
         problem: CoDesignProblem = self.options["problem"]
         middle = np.log([problem.inner.omega_S, problem.inner.omega_T]).mean(axis=1)
@@ -73,7 +73,7 @@ class CertifiedLoop(_Component):
     Inputs are θ under its names (SI), `ln_omega_S` and `ln_omega_T` (of rad/s). Outputs:
     `bandwidth` (rad/s), `sensitivity_peak`, `sensitivity_low`, `compliance` (m/N, where the problem
     bounds it), `gamma_opt`, `hardware_cost` and `constraints` (λ <= 0, where there are any). The
-    partials are the total derivatives of `TrueQuantities`. `pose` tells a model what is to be kept.
+    partials are the total derivatives of `TrueQuantities`. `pose` gives a model what is to be kept.
     """
 
     def setup(self) -> None:
@@ -84,10 +84,10 @@ class CertifiedLoop(_Component):
         bounded = [name for name, _ in problem.inner.bounds.values()]
         figures = {name: ca.exp(y) for name, y in zip(bounded, logarithms, strict=True)}
         found = {"bandwidth": bandwidth, **figures, "gamma_opt": gamma}
-        self.declared(x, found, {"bandwidth": "rad/s", "compliance": "m/N"})
+        self.declare(x, found, {"bandwidth": "rad/s", "compliance": "m/N"})
 
     def reason(self, x: Array) -> str:
-        """Why there is no design at x."""
+        """Explain why there is no design at x."""
         return f"not certified: {self._truth.at(x).figures.outcome.value}"
 
 
@@ -118,10 +118,10 @@ class LargestBandwidth(_Component):
             lambda x: np.array([at(x)[0]]), lambda x: at(x)[1][None],
         )  # fmt: skip
         theta = ca.MX.sym("theta", len(problem.names))
-        self.declared(theta, {figure.key: self._truth(theta)}, {figure.key: figure.si_unit})
+        self.declare(theta, {figure.key: self._truth(theta)}, {figure.key: figure.si_unit})
 
     def reason(self, x: Array) -> str:
-        """Why there is no design at θ."""
+        """Explain why there is no design at θ."""
         return "no certified design meets the bounds at this theta"
 
 

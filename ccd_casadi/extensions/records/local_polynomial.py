@@ -99,12 +99,12 @@ def _blocks(lines: np.ndarray, size: int) -> Iterator[np.ndarray]:
 def _widest(
     Z: np.ndarray, R: np.ndarray, lines: np.ndarray, widths: list[int], options: WindowOptions
 ) -> Parts:
-    """At each line the fit in the widest window that agrees with all narrower ones."""
+    """Choose at each line the fit in the widest window that agrees with all narrower ones."""
     fits = []
     for n in widths:
         first = np.clip(lines - n, 1, R.shape[1] - 2 * n - 1)
         window = first[:, None] + np.arange(2 * n + 1)
-        fits.append(_solved(Z, R, lines, window, n, options.order, options.transient_order,
+        fits.append(_solve(Z, R, lines, window, n, options.order, options.transient_order,
                             options.conditioned))  # fmt: skip
     chosen, growing = np.zeros(len(lines), int), np.ones(len(lines), bool)
     size = [np.einsum("kqq->kq", fit[1]).real for fit in fits]
@@ -137,13 +137,13 @@ def _periodic(
     reach = int(np.abs(window - lines[:, None]).max())
     blocks = _blocks(np.arange(len(lines)), options.at_once)
     parts = [
-        _solved(Z, R, lines[at], window[at], reach, 0, options.transient_order, options.conditioned)
+        _solve(Z, R, lines[at], window[at], reach, 0, options.transient_order, options.conditioned)
         for at in blocks
     ]
     return LocalFit(*(np.concatenate(own) for own in zip(*parts, strict=True)))
 
 
-def _solved(
+def _solve(
     Z: np.ndarray, R: np.ndarray, lines: np.ndarray, window: np.ndarray, n: int, order: int,
     transient_order: int, conditioned: float,
 ) -> Parts:  # fmt: skip

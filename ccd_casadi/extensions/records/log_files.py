@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.extensions.records.signal_names import unit_factor
 from ccd_casadi.plants.table_columns import npz_arrays, texts_of
-from ccd_casadi.support.errors import UserError, described, require
+from ccd_casadi.support.errors import UserError, describe, require
 from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.text_table import (
     cells,
@@ -81,7 +81,7 @@ def tdms_columns(path: Path) -> tuple[dict[str, np.ndarray], float | None, list[
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        raise UserError(f"{path}: is not a readable .tdms file: {described(error)}") from None
+        raise UserError(f"{path}: is not a readable .tdms file: {describe(error)}") from None
     if found:
         raise UserError(f"{path}: is cut off or damaged: {found[0]}; export it again")
     kept = [(one, own) for one, own in read if own.dtype.kind in "biuf" and own.size]
@@ -132,7 +132,7 @@ def _columns(path: Path, lines: list[str]) -> tuple[dict[str, np.ndarray], list[
     mark = _mark(lines)
     top = max(i for i, line in enumerate(lines[:30]) if line.split(mark)[0].strip('"') == NAME)
     at = next((i for i, line in enumerate(lines[:30]) if line.startswith(RATE)), top)
-    names, rates = (_trimmed(lines[i].split(mark)) for i in (top, at))
+    names, rates = (_trim(lines[i].split(mark)) for i in (top, at))
     head = RATE if at > top else NAME  # without the channels' properties all are of one time
     units = next((line.split(mark) for line in lines[at:] if line.startswith(UNIT + mark)), [])
     times = [i for i, cell in enumerate(rates) if cell == head]
@@ -156,7 +156,7 @@ def _columns(path: Path, lines: list[str]) -> tuple[dict[str, np.ndarray], list[
             if len(own) != len(clock) or np.abs(own - clock).max() > 0.0:
                 raise UserError(f"{path}: {names[i]!r} has other times than {names[kept[0]]!r}; "
                                 "export one start for all")  # fmt: skip
-        name = _named(names[i], units[i] if i < len(units) else "")
+        name = _name(names[i], units[i] if i < len(units) else "")
         if name in found:
             raise UserError(f"{path}: column {name!r} is there twice; keep one")
         found[name] = _column(path, body, i, len(rates))
@@ -168,17 +168,17 @@ def _columns(path: Path, lines: list[str]) -> tuple[dict[str, np.ndarray], list[
 
 
 def _mark(lines: Sequence[str]) -> str:
-    """What follows the first word of the file."""
+    """Return the separator, which follows the first word of the file."""
     return lines[0].removeprefix(NAME)[:1] or "\t"
 
 
-def _trimmed(row: list[str]) -> list[str]:
+def _trim(row: list[str]) -> list[str]:
     while row and not row[-1].strip():
         row.pop()
     return row
 
 
-def _named(name: str, unit: str) -> str:
+def _name(name: str, unit: str) -> str:
     word = unit.strip().split(" ")[0]
     return name if word in ("", "(None)") else f"{name} ({word})"
 
@@ -292,7 +292,7 @@ def _of_wav(path: Path) -> Read:
     try:
         rate, values = wavfile.read(path)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as WAV: {described(error)}") from None
+        raise UserError(f"{path}: cannot be read as WAV: {describe(error)}") from None
     notes = []
     if values.dtype.kind in "iu":
         offset = 128 if values.dtype.kind == "u" else 0

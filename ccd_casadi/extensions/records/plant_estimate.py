@@ -123,8 +123,8 @@ class PlantEstimate:
 
     @property
     def used(self) -> "PlantEstimate":
-        """Without the lines before the first good one, and without those beyond the last around
-        which half of the lines are good."""
+        """The estimate without the lines before the first good one, and without those beyond the
+        last around which half of the lines are good."""
         good = np.flatnonzero(~self.weak)
         near = uniform_filter1d(1.0 - self.weak, EstimateOptions.around, mode="nearest") >= 0.5
         last = np.flatnonzero(near & ~self.weak)
@@ -133,7 +133,7 @@ class PlantEstimate:
         return self.only(np.arange(good[0], last[-1] + 1))
 
     def only(self, lines: np.ndarray) -> "PlantEstimate":
-        """At some lines."""
+        """Keep these lines alone."""
         own = ("hz", "G", "spread", "coherence", "weak", "leakage")
         return replace(self, **{name: getattr(self, name)[lines] for name in own})
 

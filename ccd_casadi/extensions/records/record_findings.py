@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.svg import BLUE, GREY, log_axis, new_figure, place, style
 from ccd_casadi.extensions.records.plant_estimate import EstimateOptions, PlantEstimate
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import counted, spoken
+from ccd_casadi.support.text import plural, spoken
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def findings(
     percent = 100.0 * estimate.confidence
     worst = int(ratio.argmax())
     rows = [
-        ("response", f"{counted(len(used.hz), 'line')} from {used.hz[0]:.4g} to "
+        ("response", f"{plural(len(used.hz), 'line')} from {used.hz[0]:.4g} to "
                      f"{used.hz[-1]:.4g} Hz, hold and delay in it"),
         ("spread", f"{percent:g} % confidence at each line: {100.0 * np.median(ratio):.2g} % of "
                    f"|G| in the median, {100.0 * ratio[worst]:.3g} % at {used.hz[worst]:.4g} Hz"),
@@ -114,7 +114,7 @@ ROWS = ((5.0, 2.9), (2.75, 1.75), (0.55, 1.75))  # bottom and height, inches
 
 
 def record_picture(found: PlantEstimate, confidence: float) -> bytes:
-    """Draw a response."""
+    """Draw the estimated response."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     hz, size, used = found.hz, np.abs(found.G), found.used

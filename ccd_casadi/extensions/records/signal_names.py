@@ -52,7 +52,7 @@ def _plain(text: str) -> str:
     return " ".join(micro.replace("_", " ").split()).casefold()
 
 
-def parted(name: str) -> tuple[str, str]:
+def split_unit(name: str) -> tuple[str, str]:
     """Part the name of a column from its unit, both in small letters; "" where there is no unit.
 
     >>> parted("Position [mm]"), parted("force_command"), parted("pos_um"), parted("ActPosUm[0]")
@@ -79,12 +79,12 @@ def column_of(path: Path, role: str, names: Iterable[str], stated: str | None) -
     """
     names = list(names)
     if stated is not None:
-        exact = [name for name in names if stated in (name, parted(name)[0])]
+        exact = [name for name in names if stated in (name, split_unit(name)[0])]
         if len(exact) != 1:
             words = "is there more than once" if exact else "is not there"
             raise UserError(f"{path}: column {stated!r} {words}; it has {', '.join(names)}")
         return exact[0]
-    found = [name for name in names if parted(name)[0] in ROLES[role]]
+    found = [name for name in names if split_unit(name)[0] in ROLES[role]]
     if len(found) > 1:
         both = " or ".join(repr(name) for name in found)
         raise UserError(f"{path}: the {role} may be {both}; state which with {OPTIONS[role]}")
@@ -95,7 +95,7 @@ def factor_of(path: Path, role: str, name: str) -> tuple[float, str]:
     """Find the factor of a column to SI by the unit in its name, and that unit in words, such as
     "m, as no unit is named". Raises UserError where it is not a unit of the role.
     """
-    unit = parted(name)[1]
+    unit = split_unit(name)[1]
     if unit in ("", "-", "1"):
         return 1.0, f"{SI[role]}, as no unit is named"
     known = UNITS[role]

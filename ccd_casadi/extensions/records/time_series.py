@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.extensions.records.log_files import Columns, read_columns
-from ccd_casadi.extensions.records.signal_names import REFERENCES, column_of, factor_of, parted
+from ccd_casadi.extensions.records.signal_names import REFERENCES, column_of, factor_of, split_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -86,7 +86,7 @@ def read_record(path: Path, names: SignalNames = SignalNames()) -> TimeSeries:
         raise UserError(f"{path}: two signals are the same column; state three")
     injected = not names.open_loop and (
         names.injected is not None
-        or (names.reference is None and parted(excitation)[0] not in REFERENCES)
+        or (names.reference is None and split_unit(excitation)[0] not in REFERENCES)
     )
     scaled, units = [], []
     for role, name in (("position", position), ("force", force)):

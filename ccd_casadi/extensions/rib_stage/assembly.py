@@ -277,7 +277,7 @@ class Assembler:
                 out[box, pair] += a[i].T @ (part @ b[j])
         return out
 
-    def moved(self, sector: Sector, theta: Array, values: Array, vectors: Array) -> Array:
+    def apply_slopes(self, sector: Sector, theta: Array, values: Array, vectors: Array) -> Array:
         """(∂K - λ ∂M) φ of modes (n, k) with λ (k,): (n, θ k), reduced vectors."""
         _, dc = self.coefficients(theta)
         k, n = len(values), sector.fold.size

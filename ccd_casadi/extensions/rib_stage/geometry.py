@@ -33,7 +33,8 @@ class PointMass:
 
 @dataclass(frozen=True)
 class Geometry:
-    """What of the stage does not change with θ: side in m, material, added masses, least bay."""
+    """The quantities of the stage that do not change with θ: side in m, material, added masses,
+    least bay."""
 
     side: float = 0.3
     material: Material = field(default_factory=Material)
@@ -238,7 +239,7 @@ class MeshAxis:
 
     @property
     def nodes(self) -> int:
-        """How many nodes lie along this axis."""
+        """The number of nodes along this axis."""
         return self.starts[-1] + self.orders[-1] + 1
 
     def lengths(self, theta: Array) -> Array:

@@ -30,7 +30,7 @@ from ccd_casadi.support.worker_process import side_by_side
 
 @dataclass(frozen=True)
 class ModeCount:
-    """How many flexible modes of each symmetry are kept; `tilt` counts pairs SA, AS.
+    """The number of flexible modes of each symmetry that are kept; `tilt` counts pairs SA, AS.
 
     The default are the ten lowest of the stage of 0.59 kg and 110.5 Hz, and the cut leaves a gap
     of a tenth to the next mode of each symmetry; a third A1 mode would meet the fourth there
@@ -61,7 +61,7 @@ FORTY_FOUR = ModeCount(A1=8, B1=6, B2=8, A2=6, tilt=8)
 
 @dataclass(frozen=True)
 class Mode:
-    """Where a column of the model comes from: group, place in it, image; frequency in Hz."""
+    """The origin of a column of the model: group, place in it, image; frequency in Hz."""
 
     name: str  # symmetry: z, tip, tilt, A1, B1, B2, A2, SA, AS, or "-" without symmetry
     sector: str  # SS, SA, AS, AA, or "-"
@@ -78,13 +78,14 @@ class ModeSet:
     spectra: tuple[stage_modes.GroupModes, ...]
     flexible: tuple[Mode, ...]
 
-    def kept(self, group: int) -> int:
-        """How many of the lowest modes of a spectrum are in the model."""
+    def kept_count(self, group: int) -> int:
+        """Return the number of the lowest modes of a spectrum that are in the model."""
         return 1 + max((m.place for m in self.flexible if m.group == group), default=-1)
 
 
-def faded(values: Array, slopes: Array, full: int) -> tuple[Array, Array]:
-    """What is left of displacements of the modes of a group, and its slopes (θ, k).
+def fade(values: Array, slopes: Array, full: int) -> tuple[Array, Array]:
+    """Fade the displacements of the modes of a group, and their slopes (θ, k), towards the last
+    one.
 
     `values` (k + 1,) and `slopes` (θ, k + 1) are λ of k modes that are kept and of the next one, b;
     the first `full` count whole, a being the last of these, the others by
@@ -202,12 +203,12 @@ class RibStage:
 
     @property
     def actuator_points(self) -> tuple[Point, ...]:
-        """Where the forces act."""
+        """The points where the forces act."""
         return shape.corners(self.geometry) if self.actuators is None else self.actuators
 
     @property
     def sensor_points(self) -> tuple[Point, ...]:
-        """Where displacements are read."""
+        """The points where displacements are read."""
         return shape.corners(self.geometry) if self.sensors is None else self.sensors
 
     def mechanics(self, theta: Sequence[float], derivatives: bool = True) -> Mechanics:
@@ -218,12 +219,12 @@ class RibStage:
         entries between modes of equal frequency in a stage without symmetry). Cached; read-only.
         Without derivatives, a quarter of the work, they are those to no parameter.
         """
-        return _mechanics(self, _checked(self, theta), derivatives)
+        return _mechanics(self, _check(self, theta), derivatives)
 
     def frequencies(self, theta: Sequence[float]) -> tuple[Mode, ...]:
         """The modes of the model in the order of its rows, three rigid ones first, Hz."""
         rigid = tuple(Mode(name, "rigid", 0.0) for name in RIGID_NAMES)
-        return (*rigid, *modes_at(self, _checked(self, theta)).flexible)
+        return (*rigid, *modes_at(self, _check(self, theta)).flexible)
 
     def hardware(self, theta: Any) -> tuple[Any, dict[str, Any]]:
         """Mass in kg and λ(θ) <= 0 (no unit) for floats or CasADi symbols, in closed form."""
@@ -250,7 +251,7 @@ def orthonormal_directions(points: Sequence[Point], count: int) -> Array:
     return rows * np.where(np.einsum("ij,ij->i", rows, wanted) < 0.0, -1.0, 1.0)[:, None]
 
 
-def _checked(stage: RibStage, theta: Sequence[float]) -> tuple[float, ...]:
+def _check(stage: RibStage, theta: Sequence[float]) -> tuple[float, ...]:
     values = tuple(float(v) for v in theta)
     if len(values) != len(shape.NAMES) or not all(np.isfinite(v) and v > 0.0 for v in values):
         raise StageError(f"theta must be six lengths in m: {', '.join(shape.NAMES)}")
@@ -290,7 +291,7 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> 
     found = modes_at(stage, theta, points if derivatives else ())
     u, du, dK = _displacements(stage, found, here, points)
     lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
-    return assembled(stage, lam, u, du, dK)
+    return assemble(stage, lam, u, du, dK)
 
 
 def points_of(stage: RibStage) -> tuple[Point, ...]:
@@ -303,7 +304,7 @@ def rigid_part(stage: RibStage, theta: Array) -> tuple[Array, Array]:
     return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)
 
 
-def assembled(
+def assemble(
     stage: RibStage, lam: Array, u: Array, du: Array | None = None, dK: Array | None = None
 ) -> Mechanics:
     """The stage's matrices from λ of the flexible modes and u_z of all at the points (n, p).
@@ -359,7 +360,7 @@ def _displacements(
     du[:, :3] = slope[:count]
 
     for index, item in enumerate(found.spectra):
-        keep = found.kept(index)
+        keep = found.kept_count(index)
         F, _ = stage_modes.heights(disc, item.group, theta, points)
         own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
         seen = [
@@ -378,7 +379,7 @@ def _displacements(
                         dK[:, row, column] = modes_dK[:, mode.place, other.place]
         if stage.fading:
             lam = np.diagonal(modes_dK, 0, 1, 2)
-            w, dw = faded(item.values[:next_one], lam, keep - stage.fading)
+            w, dw = fade(item.values[:next_one], lam, keep - stage.fading)
             for row, mode in own:
                 du[:, row] = w[mode.place] * du[:, row] + dw[:, mode.place, None] * u[row]
                 u[row] *= w[mode.place]

@@ -56,7 +56,7 @@ def drawing(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> Figure
 
 
 def _bays(geometry: Geometry, theta: Sequence[float]) -> list[tuple[float, float]]:
-    """Where the four bays along an axis begin and end, mm from the centre."""
+    """List where the four bays along an axis begin and end, mm from the centre."""
     offset, slope = axis_lengths(geometry)
     half = 1e3 * np.cumsum(offset + slope @ np.array(theta, float))  # c, b_2, i, b_1, o
     inner, outer = (half[0], half[1]), (half[2], half[3])
@@ -103,7 +103,8 @@ def _cut(geometry: Geometry, theta: Sequence[float], tall: float) -> Panel:
 
 
 def _caption(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> str:
-    """How the mass changes from the first stage to the last, and which parameters with it."""
+    """Describe how the mass changes from the first stage to the last, and which parameters with
+    it."""
     names, values = list(thetas), list(thetas.values())
     words = "The ribs from above, below them a cut through the bays. "
     if geometry.point_masses:
@@ -148,7 +149,7 @@ def _rows(
 QUADRANTS = ((False, False), (True, False), (True, True), (False, True))
 MOST = 6  # modes that a page shows
 CLOSEST = 0.02  # share of the side; drawn points keep this distance inside a bay
-SHAPES = {  # by symmetry; the diagonal and the mirrors of the square tell them apart
+SHAPES = {  # by symmetry; they differ by the diagonal and the mirrors of the square
     "A1": "bowl",
     "B1": "saddle x² − y²",
     "B2": "twist",

@@ -32,9 +32,9 @@ from ccd_casadi.extensions.rib_stage.geometry import (
 from ccd_casadi.extensions.rib_stage.model import (
     TWENTY,
     RibStage,
-    assembled,
+    assemble,
     discretisation,
-    faded,
+    fade,
     points_of,
     rigid_part,
 )
@@ -43,7 +43,7 @@ from ccd_casadi.extensions.rib_stage.stage_modes import (
     Discretisation,
     Group,
     StageModeOptions,
-    compressed,
+    compress,
     discretise,
     functionals,
     groups_of,
@@ -76,8 +76,9 @@ Terms = tuple[np.ndarray, sparse.csr_matrix]
 
 @dataclass(frozen=True)
 class ReducedBasis:
-    """Of a group: V (n, r); the forms of K and of M to each coefficient, their lower triangles row
-    by row (terms, r(r + 1)/2); u on the nodes of the lower face (nodes, 3, r) of every image."""
+    """The reduced basis of a group: V (n, r); the forms of K and of M to each coefficient, their
+    lower triangles row by row (terms, r(r + 1)/2); u on the nodes of the lower face (nodes, 3, r)
+    of every image."""
 
     vectors: Array
     stiff: Array
@@ -87,7 +88,7 @@ class ReducedBasis:
 
 @dataclass(frozen=True, eq=False)
 class Bases:
-    """Those of the groups of the square, of so many θ."""
+    """The bases of the groups of the square, from these θ."""
 
     known: tuple[Theta, ...] = ()
     of: tuple[ReducedBasis, ...] = ()
@@ -139,7 +140,7 @@ def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanic
         images = (
             [of[s] for (s,) in group.images]
             if not masses
-            else [_coupled([of[s] for s in group.solved], [mass.mass for mass in masses])]
+            else [_couple([of[s] for s in group.solved], [mass.mass for mass in masses])]
         )
         kept = count + stage.fading
         for place, one in enumerate(images):
@@ -150,16 +151,16 @@ def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanic
             u[own], du[:, own], dK[:, own[:, None], own] = _slopes(one, rigid, kept, len(points))
             if stage.fading:
                 slopes = np.diagonal(_slopes(one, rigid, kept + 1, 0)[2], 0, 1, 2)
-                w, dw = faded(one.values[rigid : rigid + kept + 1], slopes, count)
+                w, dw = fade(one.values[rigid : rigid + kept + 1], slopes, count)
                 du[:, own] = w[:, None] * du[:, own] + dw[:, :, None] * u[own]
                 u[own] *= w[:, None]
         row, later = row + len(images) * count, later + stage.fading
-    return assembled(stage, lam[3:], u, du, dK)
+    return assemble(stage, lam[3:], u, du, dK)
 
 
 def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
-    """From what is known at some θ; grown from the stage's last ones where these know the first of
-    them."""
+    """Build the bases from what is known at some θ; grown from the stage's last ones where these
+    know the first of them."""
     last = _bases.pop(stage, Bases())
     have, made = (last.known, last.of) if last.known == known[: len(last.known)] else ((), ())
     disc = discretisation(stage)
@@ -169,7 +170,7 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
         def grown(
             index: int, here: Array = theta, before: Sequence[ReducedBasis] = before
         ) -> ReducedBasis:
-            return _grown(stage, disc, SQUARE_GROUPS[index], before[index], here)
+            return _grow(stage, disc, SQUARE_GROUPS[index], before[index], here)
 
         # That of the tilts takes longest.
         made = tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
@@ -187,7 +188,7 @@ def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array)
     return _wider(stage, disc, group, nothing, np.hstack(motions), ReducedBasisOptions.known_mode)
 
 
-def _grown(
+def _grow(
     stage: RibStage,
     disc: Discretisation,
     group: Group,
@@ -196,7 +197,7 @@ def _grown(
     *,
     options: ReducedBasisOptions = ReducedBasisOptions(),
 ) -> ReducedBasis:
-    """With the modes at θ, what they move by, and what forces at the points bend."""
+    """Add the modes at θ, what they move by, and what forces at the points bend."""
     masses = stage.geometry.point_masses
     count = max(TWENTY.of(group), stage.modes.of(group)) + options.beyond
     body, sector = replace(stage.geometry, point_masses=()), sector_of(disc, group.solved[0])
@@ -204,22 +205,20 @@ def _grown(
     vectors, inverse = found.vectors, found.pencil.inverse
     acting = [*points_of(stage), *((p.x, p.y) for p in masses)]
     for image in group.images:
-        bending = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[
-            0
-        ]
+        bending = compress(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[0]
         for _ in range(options.levels):
             bending = inverse(bending)
             vectors = np.hstack([vectors, bending])
             bending = found.pencil.mass(bending)
     basis = _wider(stage, disc, group, basis, vectors, options.known_mode)
-    moved = disc.assembler.moved(sector, theta, found.values, found.vectors)
+    moved = disc.assembler.apply_slopes(sector, theta, found.values, found.vectors)
     return _wider(stage, disc, group, basis, inverse(moved), options.known_slope)
 
 
 def _wider(
     stage: RibStage, disc: Discretisation, group: Group, basis: ReducedBasis, X: Array, known: float
 ) -> ReducedBasis:
-    """With what of the columns of X the basis lacks by more than so much of their length."""
+    """Add the columns of X that the basis lacks by more than `known` of their length."""
     V, r = basis.vectors, basis.vectors.shape[1]
     X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
     for _ in range(2):
@@ -247,9 +246,8 @@ def _wider(
 
 @lru_cache(maxsize=4)
 def _terms(order: MeshOrder, side: float, material: Material) -> tuple[Terms, Terms]:
-    """Of the coefficients of K, and of M, those that are no multiple of one before: where they
-    stand, and how the forms of all of them add up to theirs.
-    """
+    """Select the coefficients of K, and of M, that are no multiple of one before: where they are,
+    and how the forms of all of them add up to theirs."""
     assembler, rng = discretise(order, side, material).assembler, np.random.default_rng(0)
     low, high = np.array(LOWER), np.array(UPPER)
     places = low + rng.uniform(0.1, 0.9, (3, len(low))) * (high - low)
@@ -316,12 +314,12 @@ def _lowest(
     few, shift = min(coupled, len(values)), StageModeOptions.shift
     high = values[few:]
     bending = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + shift)[:, None]
-    Q = compressed(np.hstack([bending, bending / (high + shift)[:, None] * shift]))[0]
+    Q = compress(np.hstack([bending, bending / (high + shift)[:, None] * shift]))[0]
     own, turn = np.linalg.eigh(Q.T @ (high[:, None] * Q))
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 
 
-def _coupled(parts: Sequence[Small], masses: Sequence[float]) -> Small:
+def _couple(parts: Sequence[Small], masses: Sequence[float]) -> Small:
     """The direct sum of symmetries with point masses, which stand last among the points:
 
     M = I + G m Gᵀ, G the displacements there.

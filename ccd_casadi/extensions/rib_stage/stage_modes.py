@@ -69,8 +69,8 @@ class StageModeOptions:
 
 @dataclass(frozen=True)
 class Discretisation:
-    """What does not depend on θ: the mesh with its material, its sectors by the name of a symmetry,
-    and the side of the square in m."""
+    """The discretisation, which does not depend on θ: the mesh with its material, its sectors by
+    the name of a symmetry, and the side of the square in m."""
 
     assembler: Assembler
     sectors: dict[str, Sector]
@@ -260,7 +260,7 @@ def slopes(
     """
     lam, V = modes.values, modes.vectors
     rigid, phi = modes.rigid, V[:, :keep]
-    Q, R = compressed(F)
+    Q, R = compress(F)
     resolvent = build_resolvent(modes.pencil, np.hstack([rigid, V]), Q, lam[keep - 1])
     cluster = np.abs(lam[:keep, None] - lam[None, :]) <= StageModeOptions.cluster * lam[None, :]
     Z = []
@@ -282,7 +282,7 @@ def slopes(
     return np.where(pair, modal_dK - mean * modal_dM, 0.0), dU
 
 
-def compressed(F: Array) -> tuple[Array, Array]:
+def compress(F: Array) -> tuple[Array, Array]:
     """F (n, r) = Q R by a rank-revealing QR, Q (n, rank): u_z of one mode at the four corners
     differs by signs only, so one right-hand side is solved for instead of four."""
     Q, pivoted, pivot = qr(F, mode="economic", pivoting=True)

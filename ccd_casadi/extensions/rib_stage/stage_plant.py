@@ -27,7 +27,7 @@ from ccd_casadi.extensions.rib_stage.model import (
     RibStage,
 )
 from ccd_casadi.extensions.rib_stage.pictures import mode_shapes
-from ccd_casadi.plants.differenced import remembered
+from ccd_casadi.plants.differenced import remember
 from ccd_casadi.plants.finite_elements import Material, StageError
 from ccd_casadi.plants.fixed_parameters import with_fixed
 from ccd_casadi.plants.plant import Evaluate, Plant
@@ -94,7 +94,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
 
     def nearby(known: Sequence[Sequence[float]]) -> Evaluate:
         made = reduced.bases(stage, tuple(map(tuple, known)))
-        return remembered(lambda theta, _: reduced.mechanics(stage, made, theta))
+        return remember(lambda theta, _: reduced.mechanics(stage, made, theta))
 
     def drawing(thetas: Mapping[str, Sequence[float]]) -> Figure:
         from ccd_casadi.extensions.rib_stage import pictures
@@ -112,14 +112,14 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     plant = Plant(
         names=NAMES,
         constraint_names=tuple(constraints),
-        evaluate=remembered(stage.mechanics),
+        evaluate=remember(stage.mechanics),
         hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
         outputs=count or len(stage.sensor_points),
         inputs=count or len(stage.actuator_points),
         references={
-            name: remembered(variant.mechanics, False) for name, variant in references.items()
+            name: remember(variant.mechanics, False) for name, variant in references.items()
         },
-        values=remembered(stage.mechanics, False),
+        values=remember(stage.mechanics, False),
         expensive=reduced.applies(stage),
         nearby=nearby if reduced.applies(stage) else None,
         shapes=partial(mode_shapes, stage),

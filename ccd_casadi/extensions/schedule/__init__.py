@@ -41,7 +41,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
-    from ccd_casadi.extensions.schedule.handover import crossed, rates_tried, way_of
+    from ccd_casadi.extensions.schedule.handover import cross, rates_tried, way_of
     from ccd_casadi.extensions.schedule.rate_bound import rate_bound_of
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
@@ -71,24 +71,24 @@ def main(options: argparse.Namespace) -> ExitCode:
     folder = run_folder(
         options.case, options.out or options.case.with_name(options.case.stem + "_schedule")
     )
-    tell = partial(remark, quiet=options.quiet)
+    log = partial(remark, quiet=options.quiet)
     limits = ScheduleOptions(share=options.share, most=options.parts)
     with Workers(options.workers) as workers:
         parts, alone, whole = segments_of(
-            problem, theta, name, tell=tell, workers=workers, options=limits
+            problem, theta, name, log=log, workers=workers, options=limits
         )
         parts, frozen = kept_at_positions(
-            problem, theta, name, parts, options.positions, workers=workers, tell=tell
+            problem, theta, name, parts, options.positions, workers=workers, log=log
         )
-        segments = judge_parts(parts, theta, workers=workers, tell=tell, options=limits)
-    tell("the way over the range is simulated")
+        segments = judge_parts(parts, theta, workers=workers, log=log, options=limits)
+    log("the way over the range is simulated")
     way = way_of(problem, theta, name, segments)
     rates = rates_tried(way, seed=options.seed)
-    tell("the allowed rate is bounded")
+    log("the allowed rate is bounded")
     bound = rate_bound_of(problem, theta, name, segments)
     found = Schedule(
         name, problem.parameter_units[name], tuple(segments), tuple(alone), whole,
-        tuple(frozen), tuple(rates), bound, crossed(way, bound.rate, seed=options.seed),
+        tuple(frozen), tuple(rates), bound, cross(way, bound.rate, seed=options.seed),
     )  # fmt: skip
     answer = entry(found) | {
         "theta": dict(zip(problem.names, theta, strict=True)), "seed": options.seed,

@@ -31,7 +31,7 @@ from ccd_casadi.extensions.schedule.segments import DesignedPart, Segment
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.arrays import Array, states
 
@@ -87,7 +87,7 @@ def handovers(K: Sequence[StateSpace], *, resting: float = 1e-7) -> Array:
 
 
 def part_at(segments: Sequence[Segment], now: int, p: float) -> int:
-    """Which part controls at p, where `now` did before."""
+    """Return the part that controls at p, where `now` did before."""
     if segments[now].low <= p <= segments[now].high:
         return now
     depths = [min(p - one.low, one.high - p) for one in segments]
@@ -148,7 +148,7 @@ def sampled_plants(
     own = uncertain_plant(problem, theta)
     row = np.array(own.names) == f"theta.{name}"
     plants = own.as_written([(0, np.where(row, p, own.nominal)) for p in positions])
-    return [sampled(plant, sampling.period, sampling.delay) for plant in plants]
+    return [zoh(plant, sampling.period, sampling.delay) for plant in plants]
 
 
 def way_of(
@@ -169,14 +169,14 @@ def rates_tried(
     """Simulate the way over the whole range at rising rates, until the motion rises too much."""
     rate, found = float(np.ptp(way.places)) / way.longest(options), []
     for _ in range(options.trials):
-        found.append(crossed(way, rate, seed=seed, options=options))
+        found.append(cross(way, rate, seed=seed, options=options))
         if not found[-1].rise <= options.rise:
             break
         rate *= 2.0
     return found
 
 
-def crossed(
+def cross(
     way: Way, rate: float, *, seed: int = 0, options: CrossingOptions = CrossingOptions()
 ) -> RateTrial:
     """Simulate the way at one rate, to and fro: half the time under a random force, then without.

@@ -55,7 +55,7 @@ class RateBoundOptions:
 
 @dataclass(frozen=True)
 class PartModes:
-    """Of a part: A and Y at its positions (N, n, n), and how many modes are slow."""
+    """The modes of a part: A and Y at its positions (N, n, n), and the number of slow modes."""
 
     loops: Array
     Y: np.ndarray

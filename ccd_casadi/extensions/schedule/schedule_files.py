@@ -24,20 +24,20 @@ from ccd_casadi.extensions.schedule.segments import (
     DesignedPart,
     ScheduleOptions,
     Segment,
-    refined,
+    refine,
     within,
 )
 from ccd_casadi.fixed_structure.judgement import judge_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.lti.loop import Sampling, sampled
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import Tell, silent
-from ccd_casadi.support.text import HZ, counted, template
+from ccd_casadi.support.terminal import Log, silent
+from ccd_casadi.support.text import HZ, plural, template
 
 CODE = ("schedule.h", "schedule.c")
 
@@ -108,7 +108,7 @@ class Schedule:
 
     @property
     def least_share(self) -> float:
-        """Of ω_b over that of a position alone, the least of the positions of `alone`."""
+        """The least share of ω_b over that of a position alone, of the positions of `alone`."""
         places = [one.at for one in self.frozen]
         found = np.interp([one.at for one in self.alone], places,
                           [one.bandwidth for one in self.frozen])  # fmt: skip
@@ -136,7 +136,7 @@ def frozen_positions(
             assert one.design.controller is not None
             judged = judge_loops(plants, one.design.controller, coded, bounds, sampling,
                                  one.design.bandwidth, integrator)  # fmt: skip
-            loop = closed_loop(sampled(plants[0], sampling.period, sampling.delay), coded)
+            loop = closed_loop(zoh(plants[0], sampling.period, sampling.delay), coded)
             bandwidth = min(bandwidth, loop_figures(loop, bounds.places).bandwidth)
             failed += [] if judged.passed else [i]
         found.append(FrozenPosition(p, tuple(failed), float(bandwidth)))
@@ -145,7 +145,7 @@ def frozen_positions(
 
 def kept_at_positions(
     problem: CoDesignProblem, theta: Sequence[float], name: str, parts: Sequence[DesignedPart],
-    count: int, *, workers: Pool, tell: Tell = silent,
+    count: int, *, workers: Pool, log: Log = silent,
     options: ScheduleOptions = ScheduleOptions(),
 ) -> tuple[list[DesignedPart], list[FrozenPosition]]:  # fmt: skip
     """Judge the parts at positions; where one exceeds a bound, design it anew and judge at others.
@@ -155,15 +155,15 @@ def kept_at_positions(
     """
     parts, places = list(parts), np.linspace(parts[0].low, parts[-1].high, count)
     for turn in range(options.refinements + 1):
-        tell(f"{count} positions are judged")
+        log(f"{count} positions are judged")
         found = frozen_positions(problem, theta, name, parts, places.tolist())
         late = {i for one in found for i in one.failed}
         if not late or turn == options.refinements:
             break
         for i in late:
             own = [one.at for one in found if i in one.failed]
-            tell(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
-            parts[i] = refined(parts[i], theta, name, own, workers=workers, tell=tell)
+            log(f"part {i + 1} is designed anew: it exceeds a bound at {len(own)} positions")
+            parts[i] = refine(parts[i], theta, name, own, workers=workers, log=log)
         between = 0.5 * (places[1:] + places[:-1])
         places = np.concatenate([places[:1], between, places[-1:]])  # the ends are corners
     return parts, found
@@ -202,8 +202,8 @@ def summary(found: Schedule) -> list[str]:
            f"{one.design.bandwidth / HZ:.4g} Hz, {one.proof.words}") for one in found.segments),
         *(("alone", f"at {one.at:.4g}{unit}: {one.bandwidth / HZ:.4g} Hz") for one in found.alone),
         ("share", f"at least {100.0 * found.least_share:.3g} % of what a position has alone"),
-        ("judged", f"{kept} of {counted(len(found.frozen), 'position')} keep every bound"),
-        ("proven", f"{found.proven} of {counted(len(found.segments), 'part')}"),
+        ("judged", f"{kept} of {plural(len(found.frozen), 'position')} keep every bound"),
+        ("proven", f"{found.proven} of {plural(len(found.segments), 'part')}"),
         ("rate", f"up to {found.allowed:.3g}{unit}/s: the largest motion rises by "
          f"{100.0 * (CrossingOptions().rise - 1.0):.3g} % at most (simulated, not proven)"
          if found.allowed else "none of the simulated rates keeps the loop quiet"),
@@ -237,7 +237,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
 
 
 def schedule_page(title: str, found: Schedule) -> c.Page:
-    """Make report.html."""
+    """Make the page report.html."""
     kept = sum(one.passed for one in found.frozen)
     lead = (
         f"{len(found.segments)} controllers of the same sections, one for each part of "

@@ -27,11 +27,11 @@ from ccd_casadi.inner_problem.structured_problem import (
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import prepared, search_starts, with_range
+from ccd_casadi.inner_problem.structured_search import prepare_search, search_starts, with_range
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.terminal import Tell, silent
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.terminal import Log, silent
+from ccd_casadi.support.text import plural
 
 
 @dataclass(frozen=True)
@@ -112,15 +112,15 @@ def within(problem: CoDesignProblem, name: str, low: float, high: float) -> CoDe
 Search = Callable[[float, float, SectionsDesign | None], DesignedPart]
 
 
-def designed(
+def design_part(
     problem: CoDesignProblem, theta: Sequence[float], warm: SectionsDesign | None = None,
-    tell: Tell = silent, workers: Pool | None = None,
+    log: Log = silent, workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign]:  # fmt: skip
     """The largest bandwidth on a part, from many starts, and from a controller that keeps it."""
     own = replace(problem, start=tuple(theta))
     if warm is not None:
         own = with_state(own, warm_starts=(tuple(map(float, warm.kappa)),))
-    own, made, _ = prepared(own, tell, workers)
+    own, made, _ = prepare_search(own, log, workers)
     if warm is not None and not made.bandwidth >= warm.bandwidth:
         own, made = problem, warm  # which keeps every bound on the part, too
     return own, made
@@ -128,7 +128,7 @@ def designed(
 
 def segments_of(
     problem: CoDesignProblem, theta: Sequence[float], name: str, *,
-    workers: Pool, tell: Tell = silent,
+    workers: Pool, log: Log = silent,
     options: ScheduleOptions = ScheduleOptions(),
 ) -> tuple[list[DesignedPart], list[Alone], float]:  # fmt: skip
     """Halve the range until every part has its share of what its positions have alone.
@@ -142,24 +142,24 @@ def segments_of(
 
     def search(a: float, b: float, warm: SectionsDesign | None = None) -> DesignedPart:
         return DesignedPart(
-            a, b, *designed(within(problem, name, a, b), theta, warm, tell, workers)
+            a, b, *design_part(within(problem, name, a, b), theta, warm, log, workers)
         )
 
     alone = []
     for i, at in enumerate(np.linspace(low, high, options.positions).tolist(), 1):
-        tell(f"position {i} of {options.positions} alone, {name} = {at:.4g}")
+        log(f"position {i} of {options.positions} alone, {name} = {at:.4g}")
         made = search(at, at).design
         alone.append(Alone(at, made.bandwidth if made.certified else 0.0))
-    tell("one controller for the whole range")
+    log("one controller for the whole range")
     whole = search(low, high)
     if not whole.design.certified:
         words = f"no controller for the whole range to begin with: {whole.design.words}"
         raise UserError(f"schedule: {words}")
-    return halved(whole, alone, search, tell, options), alone, whole.design.bandwidth
+    return halve(whole, alone, search, log, options), alone, whole.design.bandwidth
 
 
-def halved(
-    whole: DesignedPart, alone: Sequence[Alone], search: Search, tell: Tell = silent,
+def halve(
+    whole: DesignedPart, alone: Sequence[Alone], search: Search, log: Log = silent,
     options: ScheduleOptions = ScheduleOptions(),
 ) -> list[DesignedPart]:  # fmt: skip
     """Halve the part with the least share, until each has the required one, or there are enough.
@@ -176,7 +176,7 @@ def halved(
         middle, d = 0.5 * (a + b), options.overlap * (b - a)
         for low, high in ((a, middle + d), (middle - d, b)):
             share = 100.0 * share_of(slowest, alone)
-            tell(f"part {low:.4g} to {high:.4g}: {share:.3g} % of what its positions have alone")
+            log(f"part {low:.4g} to {high:.4g}: {share:.3g} % of what its positions have alone")
             parts.append(search(low, high, slowest.design))
     return sorted(parts, key=lambda part: part.low)
 
@@ -192,9 +192,9 @@ def share_of(part: DesignedPart, alone: Sequence[Alone]) -> float:
                for one in inside)  # fmt: skip
 
 
-def refined(
+def refine(
     part: DesignedPart, theta: Sequence[float], name: str, positions: Sequence[float], *,
-    workers: Pool, tell: Tell = silent,
+    workers: Pool, log: Log = silent,
 ) -> DesignedPart:  # fmt: skip
     """Design a part anew from its own controller, with the plants at some positions in its set.
 
@@ -209,16 +209,16 @@ def refined(
         part.problem, scenarios=tuple(dict.fromkeys((*known, *more))),
         warm_starts=(tuple(map(float, part.design.kappa)),),
     )  # fmt: skip
-    made = search_starts(problem, theta, tell, workers, True)
+    made = search_starts(problem, theta, log, workers, True)
     return replace(part, problem=problem, design=made) if made.certified else part
 
 
 def judge_parts(
-    parts: Sequence[DesignedPart], theta: Sequence[float], *, workers: Pool, tell: Tell = silent,
+    parts: Sequence[DesignedPart], theta: Sequence[float], *, workers: Pool, log: Log = silent,
     options: ScheduleOptions = ScheduleOptions(),
 ) -> list[Segment]:  # fmt: skip
     """Judge and prove every part; the proofs, which take longest, are spread over the workers."""
-    tell(f"judge and proof of {counted(len(parts), 'part')}")
+    log(f"judge and proof of {plural(len(parts), 'part')}")
     on_boxes = [DesignOnBox(part.problem, tuple(theta), part.design) for part in parts]
     tasks = {i: (one, None, options.boxes) for i, one in enumerate(on_boxes)}
     proofs, found = dict(results(workers, DesignOnBox.proof, tasks)), []

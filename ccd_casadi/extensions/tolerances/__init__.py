@@ -33,7 +33,7 @@ EXTENSION = Extension(
     needs=["ccd_casadi.extensions.tolerances.answers"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.cases.run_folder import read_run

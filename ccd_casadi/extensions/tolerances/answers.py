@@ -25,15 +25,15 @@ from ccd_casadi.extensions.tolerances.prices import (
     prices,
     tolerances_of,
 )
-from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, started
+from ccd_casadi.extensions.tolerances.share_search import ShareSearch, search_share, start_search
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.searched_problem import state_of, with_state
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertify
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.errors import UserError
@@ -108,7 +108,7 @@ def _require_known(
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command ends with."""
+    """The result of a command."""
 
     entry: dict[str, Any]  # of tolerances.json
     words: tuple[str, ...]  # lines for the terminal
@@ -136,14 +136,14 @@ def design_for_share(
     """
     assert of.plan is not None
 
-    def tell(words: str) -> None:
+    def log(words: str) -> None:
         remark(f"share: {words}", sampler.quiet)
 
     problem, whole, at = sampler.problem, None, theta or of.problem.start
     if theta is not None:
         fixed = with_state(replace(problem, start=theta), seed=seed)
         with within_budget(minutes):
-            problem, made, _ = prepared(fixed, tell, sampler.workers)
+            problem, made, _ = prepare_search(fixed, log, sampler.workers)
         whole = made if made.certified else None
     else:
         formulation = formulation_of(of.case, usual_name(of.case, len(problem.names)))
@@ -152,9 +152,9 @@ def design_for_share(
             problem, whole, at = verified.problem, verified.design, verified.theta
     kappa = None if whole is None else whole.kappa
     with within_budget(minutes):
-        first = started(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, tell)
-        found = search_share(first, tell, moves=theta is None)
-    design = recertified(found.problem, found.best.theta, found.design)
+        first = start_search(sampler.of(problem), at, kappa, of.plan, of.distribution, seed, log)
+        found = search_share(first, log, moves=theta is None)
+    design = recertify(found.problem, found.best.theta, found.design)
     on_box = DesignOnBox(found.problem, found.best.theta, design)
     judged = certified_share(on_box, of.plan, of.distribution, seed, sampler.workers)
     return ShareDesign(whole, at, found, design, judged)
@@ -223,12 +223,12 @@ def share_answer(found: ShareDesign) -> Answer:
 def price_answer(run: FinishedRun, sampler: Sampler, quiet: bool) -> Answer:
     """The price list of a run; with `cost_per_percent` the half-widths that cost least."""
 
-    def tell(words: str) -> None:
+    def log(words: str) -> None:
         remark(f"prices: {words}", quiet)
 
     assert run.kappa is not None
     table = run.case.robust
-    bandwidth, found = prices(run.problem, run.theta, run.kappa, sampler.workers, tell)
+    bandwidth, found = prices(run.problem, run.theta, run.kappa, sampler.workers, log)
     entry: dict[str, Any] = {"bandwidth_hz": bandwidth / HZ, "prices": [p.entry for p in found]}
     words = [f"design        {number(bandwidth / HZ)} Hz with all tolerances",
              *(f"price         {price.words}" for price in found)]  # fmt: skip
@@ -236,7 +236,7 @@ def price_answer(run: FinishedRun, sampler: Sampler, quiet: bool) -> Answer:
         return Answer(entry, tuple(words), True, {})
 
     def tell_of(one: Bought) -> None:
-        tell(f"J = {number(one.objective, 7)} at {_widths_words(one)}")
+        log(f"J = {number(one.objective, 7)} at {_widths_words(one)}")
 
     best = buy(sampler, run.theta, run.kappa, table.cost_per_percent, table.half_width or {},
                tell_of)  # fmt: skip

@@ -81,8 +81,8 @@ def draw_machines(
 
 @dataclass(frozen=True)
 class Trial:
-    """What accepts a design: `rounds` times the certificate's number of fresh draws, of which at
-    most `allowed` fail in all."""
+    """The test that accepts a design: `rounds` times the certificate's number of fresh draws, of
+    which at most `allowed` fail in all."""
 
     rounds: int
     allowed: int
@@ -90,7 +90,8 @@ class Trial:
 
 @dataclass(frozen=True)
 class Plan:
-    """How many draws decide on a share at a confidence, and what accepts a design before."""
+    """The plan of draws that decide on a share at a confidence, and the test that accepts a design
+    before."""
 
     share: float
     confidence: float
@@ -101,18 +102,18 @@ class Plan:
         """Fresh draws of the certificate."""
         return ceil(self.options.enough * log1p(-self.confidence) / log(self.share))
 
-    def shown(self, failed: int) -> float:
+    def shown_share(self, failed: int) -> float:
         """The share of all machines that is shown to keep the bounds if `failed` draws do not."""
         return yield_bound(self.draws - failed, self.draws, self.confidence)
 
     @cached_property
     def allowed(self) -> int:
         """The most of the certificate's draws that may fail."""
-        return next(m for m in count() if self.shown(m + 1) < self.share)
+        return next(m for m in count() if self.shown_share(m + 1) < self.share)
 
     @cached_property
     def trial(self) -> Trial:
-        """What accepts a design: at most c failures in r fresh rounds of n = `draws` each.
+        """The test that accepts a design: at most c failures in r fresh rounds of n = `draws` each.
 
         Of a design of which a share q fails, whatever q is,
 
@@ -148,7 +149,7 @@ class ShareCertificateOptions:
 
 @dataclass(frozen=True)
 class ShareCertificate:
-    """How many fresh machines keep every bound."""
+    """The share of fresh machines that keep every bound."""
 
     plan: Plan  # the share, its confidence, and the number of draws
     failed: int  # of these
@@ -157,7 +158,7 @@ class ShareCertificate:
     @property
     def least(self) -> float:
         """The share of all machines that is shown, at the confidence."""
-        return self.plan.shown(self.failed)
+        return self.plan.shown_share(self.failed)
 
     @property
     def passed(self) -> bool:
@@ -175,7 +176,7 @@ class ShareCertificate:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Figures for tolerances.json."""
+        """The figures for tolerances.json."""
         plan = self.plan
         return {
             "share": plan.share, "confidence": plan.confidence, "draws": plan.draws,
@@ -206,6 +207,6 @@ def certified_share(
     rng = np.random.default_rng((seed, options.seed))
     fresh = draw_machines(on_box.uncertain, distribution, rng, plan.draws)
     size = options.batch
-    tasks = {i: (on_box.kept, fresh[i : i + size]) for i in range(0, len(fresh), size)}
+    tasks = {i: (on_box.find_kept, fresh[i : i + size]) for i in range(0, len(fresh), size)}
     counts = dict(results(workers, count_failures, tasks)).values()
     return ShareCertificate(plan, *(sum(each) for each in zip(*counts, strict=True)))

@@ -38,7 +38,7 @@ from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -50,7 +50,7 @@ SHARES = ("resonance_shift", "mode_shift", "gain")  # half-widths as shares
 
 @dataclass(frozen=True)
 class Price:
-    """What one tolerance costs, in rad/s."""
+    """The price of one tolerance, in rad/s."""
 
     name: str  # of the tolerance
     width: str  # how wide it is, in words
@@ -60,14 +60,14 @@ class Price:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of tolerances.json."""
+        """The entry of tolerances.json."""
         hz = {"costs_hz": self.cost, "half_buys_hz": self.half_buys, "slope_hz": self.slope}
         found = {key: w / HZ for key, w in hz.items()}
         return {"tolerance": self.name, "width": self.width, **found}
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The price in one line."""
         cost, buys = number(self.cost / HZ, 3), number(self.half_buys / HZ, 3)
         return f"{self.name} {self.width}: costs {cost} Hz; half of it buys {buys} Hz"
 
@@ -78,7 +78,7 @@ def tolerances_of(problem: CoDesignProblem) -> tuple[str, ...]:
     return tuple(dict.fromkeys(map(tolerance_of, names)))
 
 
-def scaled(problem: CoDesignProblem, name: str, factor: float) -> CoDesignProblem:
+def scale_width(problem: CoDesignProblem, name: str, factor: float) -> CoDesignProblem:
     """Scale the width of one tolerance around the model; damping in its logarithm."""
     own: Uncertainty = structured_of(problem).uncertainty
     if name in SHARES:
@@ -101,7 +101,7 @@ def scaled(problem: CoDesignProblem, name: str, factor: float) -> CoDesignProble
 
 
 def width_words(problem: CoDesignProblem, name: str) -> str:
-    """How wide a tolerance is."""
+    """Describe how wide a tolerance is."""
     own = structured_of(problem).uncertainty
     if name in SHARES:
         return f"±{100.0 * getattr(own, name):g} %"
@@ -110,20 +110,20 @@ def width_words(problem: CoDesignProblem, name: str) -> str:
     return f"{low:g} to {high:g}"
 
 
-def redesigned(
+def redesign(
     problem: CoDesignProblem, theta: Sequence[float], kappa: Array, workers: Pool | None = None
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     """The best from a controller at θ on the worst plants of the problem's own box: the problem at
     θ with these plants, and the design."""
     at = replace(problem, start=tuple(map(float, theta)))
     at = with_state(at, warm_starts=(tuple(map(float, kappa)),), scenarios=())
-    found, made, _ = prepared(at, silent, workers, only_warm_starts=True)
+    found, made, _ = prepare_search(at, silent, workers, only_warm_starts=True)
     return found, made
 
 
 def prices(
     problem: CoDesignProblem, theta: Sequence[float], kappa: Array, workers: Pool | None,
-    tell: Callable[[str], object],
+    log: Callable[[str], object],
 ) -> tuple[float, tuple[Price, ...]]:  # fmt: skip
     """Price every tolerance of a design.
 
@@ -131,7 +131,7 @@ def prices(
     ----------
     problem, theta, kappa : CoDesignProblem, sequence of float, array
         Of a finished run, SI.
-    workers, tell : Pool or None, callable
+    workers, log : Pool or None, callable
 
     Returns
     -------
@@ -139,12 +139,12 @@ def prices(
         ω_b of the design with all of them, rad/s.
     prices : tuple of Price
     """
-    own, made = redesigned(problem, theta, kappa, workers)
+    own, made = redesign(problem, theta, kappa, workers)
     slopes = DesignOnBox(own, theta, made).tolerance_prices()
 
     def at(name: str, factor: float) -> float:
-        _, found = redesigned(scaled(problem, name, factor), theta, made.kappa, workers)
-        tell(f"{name} times {factor:g}: {found.bandwidth / HZ:.5g} Hz")
+        _, found = redesign(scale_width(problem, name, factor), theta, made.kappa, workers)
+        log(f"{name} times {factor:g}: {found.bandwidth / HZ:.5g} Hz")
         # the design of the wider set is one of the narrower set, whatever the search found
         return max(found.bandwidth if found.certified else 0.0, made.bandwidth)
 
@@ -202,14 +202,14 @@ def bought(
     case, problem = structured_of(sampler.problem).uncertainty, sampler.problem
     changed: dict[str, Any] = dict(widths)
     wide = with_structured(problem, uncertainty=replace(case, **changed))
-    own, made = redesigned(wide, near.theta, near.kappa, sampler.workers)
+    own, made = redesign(wide, near.theta, near.kappa, sampler.workers)
     if not made.certified:
         return None
     there = sampler.of(own)
     start = there.value_from(near.theta, made.kappa.tolist())
     theta = pieces_from(there, start, options.polish).theta if start.feasible else near.theta
     if theta != near.theta:  # whose worst plants are others
-        moved = redesigned(wide, theta, made.kappa, sampler.workers)
+        moved = redesign(wide, theta, made.kappa, sampler.workers)
         if not moved[1].certified:
             theta = near.theta
         else:
@@ -227,13 +227,13 @@ def bought(
 
 def buy(
     sampler: Sampler, theta: Sequence[float], kappa: Array, costs: Mapping[str, float],
-    between: Mapping[str, Sequence[float]], tell: Callable[[Bought], object],
+    between: Mapping[str, Sequence[float]], log: Callable[[Bought], object],
     options: WidthOptions = WidthOptions(),
 ) -> WidthSearch | None:  # fmt: skip
     """Search half-widths, machine and controller together, from θ and κ of a finished run, SI.
 
     `costs` are what f rises by for a percent, `between` the least and largest half-width, both by
-    name; `tell` is given every design. None where the run's design is not found again.
+    name; `log` is given every design. None where the run's design is not found again.
     """
     own = structured_of(sampler.problem).uncertainty
     case = {name: getattr(own, name) for name in costs}
@@ -244,7 +244,7 @@ def buy(
     first = at(case, near=start)
     if first is None:
         return None
-    tell(first)
+    log(first)
     best, count = first, 1
 
     def J(u: Array) -> tuple[float, Array]:
@@ -255,7 +255,7 @@ def buy(
             return 2.0 * abs(first.objective) + first.objective, np.zeros(len(u))
         if found is not first:
             count += 1
-            tell(found)
+            log(found)
         best = min(best, found, key=lambda one: one.objective)
         return found.objective, np.array([found.slopes.get(name, 0.0) for name in costs])
 
@@ -265,12 +265,12 @@ def buy(
     if 2 ** len(bounds) <= options.corners:
         for corner in product(*bounds.tolist()):
             J(np.array(corner))
-    return WidthSearch(best, first, count, promised(best, costs, bounds))
+    return WidthSearch(best, first, count, promised_gain(best, costs, bounds))
 
 
-def promised(best: Bought, costs: Mapping[str, float], bounds: Array) -> float:
-    """What the slopes promise from a design up to the bounds (n, 2) of ln t: at least as much as J
-    can fall where it is convex in ln t."""
+def promised_gain(best: Bought, costs: Mapping[str, float], bounds: Array) -> float:
+    """Compute what the slopes promise from a design up to the bounds (n, 2) of ln t: at least as
+    much as J can fall where it is convex in ln t."""
     if set(best.slopes) != set(costs):
         return np.nan
     u = np.log([best.widths[name] for name in costs])

@@ -32,13 +32,13 @@ from ccd_casadi.inner_problem.searched_problem import (
 )
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import Uncertainty, structured_of, with_structured
-from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.inner_problem.structured_search import prepare_search
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import NoDesign
-from ccd_casadi.support.terminal import Tell
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.terminal import Log
+from ccd_casadi.support.text import plural
 from ccd_casadi.support.time_budget import ends_early
 
 
@@ -96,12 +96,12 @@ class ShareSearch:
 
     @property
     def problem(self) -> CoDesignProblem:
-        """With the working set."""
+        """The problem with the working set."""
         return self.sampler.problem
 
     @property
     def design(self) -> SectionsDesign:
-        """With its controller and certificate on the working set."""
+        """The design with its controller and certificate on the working set."""
         return value_with_design(self.sampler, self.best).design
 
     def may_fail(self, options: ShareOptions) -> int:
@@ -128,18 +128,18 @@ class ShareSearch:
         wider = replace(self, tail=(*self.tail, *nearest), rounds=self.rounds + 1)
         return wider, int((value > WorstPlantOptions.within).sum())
 
-    def ranked(self) -> dict[Scenario, float]:
+    def rank(self) -> dict[Scenario, float]:
         """The draws ranked again and their excesses, the worst first."""
         value = self.excesses(self.tail)
         order = np.argsort(-value, kind="stable")
         return {scenario_of(self.tail[i]): float(value[i]) for i in order}
 
     def failing(self) -> list[Scenario]:
-        """Those of them that exceed a bound."""
-        return [one for one, value in self.ranked().items() if value > WorstPlantOptions.within]
+        """List those machines that exceed a bound."""
+        return [one for one, value in self.rank().items() if value > WorstPlantOptions.within]
 
-    def redesigned(self, tell: Tell, options: ShareOptions, fewer: int = 0) -> "ShareSearch":
-        """With the machines that exceed a bound and are not given up, until there are none.
+    def redesign(self, log: Log, options: ShareOptions, fewer: int = 0) -> "ShareSearch":
+        """Add the machines that exceed a bound and are not given up, until there are none.
 
         `fewer`: by which the next design fails on at least, so that none is tried twice.
         """
@@ -152,15 +152,15 @@ class ShareSearch:
             if not added or ends_early("design on drawn machines"):
                 break
             search = search.on((*known, *added))
-            search.tell(tell, f"{counted(len(over), 'machine')} exceeded a bound, {may} may")
-        return search.relieved(tell, options, may)
+            search.log(log, f"{plural(len(over), 'machine')} exceeded a bound, {may} may")
+        return search.relieve(log, options, may)
 
-    def relieved(self, tell: Tell, options: ShareOptions, may: int) -> "ShareSearch":
-        """Without the machine that costs most, again and again, while no more than may fail do: the
+    def relieve(self, log: Log, options: ShareOptions, may: int) -> "ShareSearch":
+        """Drop the machine that costs most, again and again, while no more than may fail do: the
         set has machines that joined when fewer were given up."""
         search, J = self, partial(objective_of, self.problem)
         while not ends_early("design without a machine"):
-            ranked, known = search.ranked(), state_of(search.problem).scenarios
+            ranked, known = search.rank(), state_of(search.problem).scenarios
             if sum(value > WorstPlantOptions.within for value in ranked.values()) >= may:
                 break
             binding = [one for one in known if ranked.get(one, -np.inf) > -options.binds]
@@ -171,13 +171,13 @@ class ShareSearch:
             if (other := next(found, None)) is None:
                 break
             search = other
-            search.tell(tell, "one that binds was given up")
+            search.log(log, "one that binds was given up")
         return search
 
-    def tell(self, tell: Tell, words: str) -> None:
+    def log(self, log: Log, words: str) -> None:
         """A line of progress."""
-        shown = self.problem.figure.shown(self.best.value)
-        tell(f"{shown} on {len(state_of(self.problem).scenarios)} machines; {words}")
+        shown = self.problem.figure.format_value(self.best.value)
+        log(f"{shown} on {len(state_of(self.problem).scenarios)} machines; {words}")
 
     def on(self, scenarios: tuple[Scenario, ...]) -> "ShareSearch":
         """The best from its own controller on another working set, at the same θ.
@@ -197,7 +197,7 @@ class ShareSearch:
         return replace(self, sampler=sampler, best=best)
 
     def at_its_theta(
-        self, tell: Tell, options: ShareOptions, trial: Trial, designs: int
+        self, log: Log, options: ShareOptions, trial: Trial, designs: int
     ) -> "ShareSearch":
         """Trials and designs at one θ, until new draws accept a design."""
         search = replace(self, settled=False)
@@ -206,7 +206,7 @@ class ShareSearch:
             for number in range(1, trial.rounds + 1):
                 search, more = search.with_draws(options)
                 failing += more
-                tell(
+                log(
                     f"{failing} of {number * search.plan.draws} new machines fail; "
                     f"{trial.allowed} of {trial.rounds * search.plan.draws} may"
                 )
@@ -218,7 +218,7 @@ class ShareSearch:
                     return search
             if ends_early("round of drawn machines"):
                 break
-            search = search.redesigned(tell, options, fewer=1)
+            search = search.redesign(log, options, fewer=1)
         return search
 
 
@@ -228,9 +228,9 @@ def scenario_of(machine: Machine) -> Scenario:
     return option, tuple(map(float, point))
 
 
-def started(
+def start_search(
     sampler: Sampler, theta: tuple[float, ...], kappa: Array | None, plan: Plan,
-    distribution: Mapping[str, str], seed: int, tell: Tell,
+    distribution: Mapping[str, str], seed: int, log: Log,
 ) -> ShareSearch:  # fmt: skip
     """Begin with the model of every option alone.
 
@@ -242,7 +242,7 @@ def started(
         known = structured_of(problem).uncertainty.options
         alone = with_state(replace(problem, start=theta), seed=seed)
         alone = with_structured(alone, uncertainty=Uncertainty(options=known))
-        found, made, _ = prepared(alone, tell, sampler.workers)
+        found, made, _ = prepare_search(alone, log, sampler.workers)
         if not made.certified:
             raise NoDesign(f"no controller was found for the model alone: {made.words}")
         own, kappa = structured_of(found), made.kappa
@@ -259,25 +259,26 @@ def started(
 
 
 def search_share(
-    search: ShareSearch, tell: Tell, *, moves: bool, options: ShareOptions = ShareOptions()
+    search: ShareSearch, log: Log, *, moves: bool, options: ShareOptions = ShareOptions()
 ) -> ShareSearch:
     """Search over θ, where it may move, and controller: the best, settled where the plan's trial
-    has accepted it. `tell` is given lines of progress.
+    has accepted it. `log` is given lines of progress.
     """
     trial = search.plan.trial
     short = Trial(1, -(-trial.allowed // trial.rounds))
 
     def screened(one: ShareSearch) -> ShareSearch:
-        return one.at_its_theta(tell, options, short, options.rounds)
+        return one.at_its_theta(log, options, short, options.rounds)
 
     J = partial(objective_of, search.problem)
 
     def better(best: InnerSample) -> ShareSearch:
-        """From there, where that is better than from here, on the draws of both."""
+        """Continue from a better design where it is better than the present one on the draws of
+        both."""
         if not J(best) < J(search.best) - options.settled * abs(J(search.best)):
             return search
         there = screened(replace(search, best=best))
-        here = replace(search, tail=there.tail, rounds=there.rounds).redesigned(tell, options)
+        here = replace(search, tail=there.tail, rounds=there.rounds).redesign(log, options)
         return min((here, there), key=lambda one: J(one.best))
 
     search = screened(search)
@@ -290,4 +291,4 @@ def search_share(
         search = better(pieces_from(search.sampler, search.best, options.settled))
         if search.best.theta == before:
             break
-    return search.at_its_theta(tell, options, trial, search.plan.options.attempts)
+    return search.at_its_theta(log, options, trial, search.plan.options.attempts)

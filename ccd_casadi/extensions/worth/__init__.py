@@ -22,7 +22,7 @@ EXTENSION = Extension(
     needs=["ccd_casadi.extensions.worth.worth_estimate"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Run the command."""
     from ccd_casadi.extensions.worth.worth_estimate import worth, worth_words
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore

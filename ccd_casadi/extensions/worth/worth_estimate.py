@@ -146,7 +146,7 @@ def worth(
     hardware = design_hardware(
         sampler.problem, resonance, starts=0 if slow else 8, seed=seed, workers=sampler.workers
     )
-    outer = outer_of(sampler).prepared(seed)
+    outer = outer_of(sampler).prepare(seed)
     sampler, problem = outer.sampler, outer.problem
     distance = np.abs(np.subtract(hardware.theta, problem.start) / (upper - lower)).max()
     first = [hardware.theta]
@@ -194,7 +194,7 @@ def worth(
     for entry, sample in zip(entries, (sequential, best), strict=True):
         if sample.feasible:
             controller = baseline.design_of(sample)
-            entry["survives"] = baseline.judged(sample.theta, controller, sampler.workers)[1].entry
+            entry["survives"] = baseline.judge(sample.theta, controller, sampler.workers)[1].entry
     cost, bandwidth = entries[0]["hardware_cost"], sequential.bandwidth
     gain = objective(problem, sequential.theta, bandwidth) - objective_of(problem, best)
     return {
@@ -270,7 +270,7 @@ def outlook(
 
 
 def search_error(sampler: Sampler, best: InnerSample) -> float:
-    """By how much a full solve may end with another bandwidth at the same θ (rad/s).
+    """Estimate by how much a full solve may end with another bandwidth at the same θ (rad/s).
 
     The loss to the worst plants found in the box, and, where only one start of the multi-start
     search reached the best controller, its distance to the next local optimum: a better optimum may
