@@ -46,7 +46,7 @@ def best(action, seconds: float, least: int = 3) -> float:
 
 def certify(problem: Problem, controller, gamma: float) -> str:
     """What the project's own certificate says of a controller at its γ."""
-    plant, w = problem.plant, problem.weights.scaled(problem.plant.omega_0)
+    plant, w = problem.plant, problem.weights.scale(problem.plant.omega_0)
     row = np.full(int(Column.COUNT), np.nan)
     Ak, Bk, Ck, Dk = (np.ascontiguousarray(matrix, float) for matrix in controller)
     low = OMEGA_LOW / plant.omega_0
@@ -57,7 +57,7 @@ def certify(problem: Problem, controller, gamma: float) -> str:
 def by_mixsyn(problem: Problem) -> tuple[float, str]:
     """Time and certificate of control.mixsyn; K at its own γ, as it hands it over."""
     plant = problem.plant
-    M_S, A_S, omega_S, c_K, omega_K, A_l, A_u, omega_T = problem.weights.scaled(plant.omega_0)
+    M_S, A_S, omega_S, c_K, omega_K, A_l, A_u, omega_T = problem.weights.scale(plant.omega_0)
     p, m = plant.C.shape[0], plant.B.shape[1]
 
     def diagonal(num, den, count):
@@ -75,7 +75,7 @@ def by_mixsyn(problem: Problem) -> tuple[float, str]:
 def by_sb10ad(problem: Problem) -> tuple[float, str]:
     """Time and certificate of slycot's SB10AD: job 1 from γ = 1e3, then job 4 at 1.02·γ."""
     plant = problem.plant
-    w = problem.weights.scaled(plant.omega_0)
+    w = problem.weights.scale(plant.omega_0)
     A, B1, B2, C1, C2, d1, d2 = generalized_plant(plant.A, plant.B, plant.C, w)
     p, m = C2.shape[0], B2.shape[1]
     B, C = np.hstack([B1, B2]), np.vstack([C1, C2])
@@ -95,7 +95,7 @@ def by_sb10ad(problem: Problem) -> tuple[float, str]:
 def by_ours(problem: Problem) -> tuple[float, float, str]:
     """Time in a sweep and of a single cold design, certificate and figures included."""
     plant = problem.plant
-    w = problem.weights.scaled(plant.omega_0)
+    w = problem.weights.scale(plant.omega_0)
     low = OMEGA_LOW / plant.omega_0
     # around the problem's own break frequencies, as dense as the paper's 20 x 20 sweep
     omega_S = problem.weights.omega_S / plant.omega_0 * np.geomspace(0.5, 4.0, 20)
@@ -115,7 +115,7 @@ def by_ours(problem: Problem) -> tuple[float, float, str]:
 def floor(problem: Problem) -> float:
     """One ordered Schur form of the Hamiltonian: what every γ test has to do."""
     plant = problem.plant
-    gp = generalized_plant(plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0))
+    gp = generalized_plant(plant.A, plant.B, plant.C, problem.weights.scale(plant.omega_0))
     _, B1, _, C1, _, d1, _ = gp
     H0 = lqr_hamiltonian(gp)
     found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8, RiccatiOptions.noise)[0]
@@ -127,7 +127,7 @@ def floor(problem: Problem) -> float:
 def one_cold(problem: Problem) -> tuple[float, str]:
     """Time of a single design of a plant that is too large to be swept here, and its verdict."""
     plant = problem.plant
-    data = (plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0), plant.grid)
+    data = (plant.A, plant.B, plant.C, problem.weights.scale(plant.omega_0), plant.grid)
     end = (plant.gain, BACKOFF, OMEGA_LOW / plant.omega_0, 0.0)
     row = design(*data, *end)[0]
     return best(lambda: design(*data, *end), 2.0), Code(int(row[Column.CODE])).name.lower()

@@ -28,3 +28,5 @@ class MoveLimits:
 
 
 LIMITS = MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4)  # the move that is made where none is given
+# Constraints of a motor: the share of what it allows, less 1.
+MOTOR_LIMITS = {"peak force": "peak_share", "motor power": "heat_share"}

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from ccd_casadi.analysis import MoveLimits
+from ccd_casadi.analysis import MOTOR_LIMITS, MoveLimits
 from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
 from ccd_casadi.lti.loop import Sampling
@@ -21,9 +21,6 @@ from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import UserError
-
-# Constraints of a motor: the share of what it allows, less 1.
-MOTOR_LIMITS = {"peak force": "peak_share", "motor power": "heat_share"}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from enum import StrEnum
 from math import isfinite, nan
 from typing import Any
 
-from ccd_casadi.analysis.motor import MOTOR_LIMITS
+from ccd_casadi.analysis import MOTOR_LIMITS
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words

@@ -48,7 +48,7 @@ class FigureOfMerit:
     def format_value(self, value: float, digits: int = 4) -> str:
         """The value with its unit, a length or a time with the prefix that its size needs.
 
-        >>> RMS_ERROR.shown(12.3456e-9)
+        >>> RMS_ERROR.format_value(12.3456e-9)
         '12.35 nm'
         """
         if self is BANDWIDTH:

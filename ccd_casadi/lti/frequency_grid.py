@@ -104,7 +104,7 @@ def thin(values: Array, width: float) -> Array:
 
     Examples
     --------
-    >>> thinned(np.array([1.0, 1.01, 2.0, 1.02]), 0.1).tolist()
+    >>> thin(np.array([1.0, 1.01, 2.0, 1.02]), 0.1).tolist()
     [1.0, 2.0]
     """
     ascending = np.sort(values[values > 0.0])

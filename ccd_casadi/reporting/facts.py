@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import UndefinedError
 
-from ccd_casadi.analysis.motor import MOTOR_LIMITS
+from ccd_casadi.analysis import MOTOR_LIMITS
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -227,7 +227,7 @@ def restore(kind: Any, data: Any) -> Any:
 
     Examples
     --------
-    >>> restored(tuple[float, ...], [1.5, "inf"])
+    >>> restore(tuple[float, ...], [1.5, "inf"])
     (1.5, inf)
     """
     origin, args = get_origin(kind), get_args(kind)

@@ -77,7 +77,7 @@ def wrap(line: str, width: int) -> str:
 
     Examples
     --------
-    >>> print(wrapped("survives      warned   stable for resonances -0.76 to +7.9 %", 48))
+    >>> print(wrap("survives      warned   stable for resonances -0.76 to +7.9 %", 48))
     survives      warned   stable for resonances
                            -0.76 to +7.9 %
     """

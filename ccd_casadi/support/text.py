@@ -178,7 +178,7 @@ def plural(number: int, noun: str) -> str:
 
     Examples
     --------
-    >>> counted(1, "plant"), counted(5, "plant")
+    >>> plural(1, "plant"), plural(5, "plant")
     ('1 plant', '5 plants')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -31,7 +31,7 @@ from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.terminal import Log
 
 HZ = 2.0 * np.pi
 SAMPLING = Sampling(drive.RATE_HZ)
@@ -78,7 +78,7 @@ def design(
     starts: int = 8,
     seed: int = 2,
     workers: int = 1,
-    progress: Tell | None = None,
+    progress: Log | None = None,
 ) -> SectionsDesign:
     """The largest bandwidth on 17 temperatures with each of the PZT's gains.
 
@@ -122,7 +122,7 @@ class ErrorDesign:
 
 
 def least_error(
-    kappa: np.ndarray, lines: np.ndarray, progress: Tell | None = None
+    kappa: np.ndarray, lines: np.ndarray, progress: Log | None = None
 ) -> ErrorDesign:
     """From the largest bandwidth to nearly the least worst RMS error of the nine plants.
 

@@ -10,7 +10,10 @@ import numpy as np
 from oracles.sources import ROOT, SOURCES, nodes
 
 # Pipes between the processes of one run.
-LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/extensions/cluster/dask_pool.py"}
+LIVE = {
+    "ccd_casadi/support/worker_process.py", "ccd_casadi/support/lent_pool.py",
+    "ccd_casadi/extensions/cluster/dask_pool.py",
+}  # fmt: skip
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {

@@ -47,7 +47,7 @@ def test_what_the_set_up_compiles_is_all_that_the_library_calls() -> None:
                   omega_low=OMEGA_LOW)  # fmt: skip
             measure(plant, design.controller, weights, gamma=2.0, omega_low=OMEGA_LOW)
             numbers = (plant.grid, plant_gain(plant.A, plant.B, plant.C, plant.grid), 1.02, 0.0)
-            search(plant.A, plant.B, plant.C, weights.scaled(plant.omega_0), *numbers, True)
+            search(plant.A, plant.B, plant.C, weights.scale(plant.omega_0), *numbers, True)
     assert isinstance(design.controller, StateSpace)
     assert found.names == []
 
@@ -67,7 +67,7 @@ def test_no_kernel_returns_a_named_tuple_to_python() -> None:
         for made in kernel.overloads.values()
         for part in _parts(made.signature.return_type)
     }
-    assert "ccd_casadi.kernels.riccati_synthesis._mixed" in {name for name, _ in returned}
+    assert "ccd_casadi.kernels.riccati_synthesis._prepare" in {name for name, _ in returned}
     assert {name for name, part in returned if isinstance(part, types.BaseNamedTuple)} == set()
 
 

@@ -17,7 +17,7 @@ from ccd_casadi.support.arrays import Array
 
 def weights(plant: ScaledPlant, log_S: float, log_T: float) -> Array:
     omega_0 = plant.omega_0
-    return PAPER.at(omega_0 * 10.0 ** (log_S - 2.0), omega_0 * 10.0 ** (log_T - 1.5)).scaled(
+    return PAPER.at(omega_0 * 10.0 ** (log_S - 2.0), omega_0 * 10.0 ** (log_T - 1.5)).scale(
         omega_0
     )
 
@@ -65,7 +65,7 @@ def test_a_design_that_the_bound_limits_has_the_error_of_the_bound() -> None:
 def test_where_the_limit_passes_from_the_riccati_level_to_the_bound_both_sides_agree() -> None:
     """γ_opt is continuous in the force weight; the level itself is tested a hair above γ_jω."""
     plant = flexible_case(30).plant
-    w = PAPER.at(10.0**0.179 * plant.omega_0, 0.3 * plant.omega_0).scaled(plant.omega_0)
+    w = PAPER.at(10.0**0.179 * plant.omega_0, 0.3 * plant.omega_0).scale(plant.omega_0)
 
     def data(exponent: float) -> tuple[Array, ...]:
         changed = w.copy()

@@ -41,7 +41,7 @@ def test_the_pull_back_is_the_adjoint_of_building_the_plant(seed: int, m: int, p
     n = 4
     A, B, C = (rng.normal(size=shape) for shape in ((n, n), (n, m), (p, n)))
     dA, dB, dC = (rng.normal(size=matrix.shape) for matrix in (A, B, C))
-    w = PAPER.scaled(100.0 * HZ)
+    w = PAPER.scale(100.0 * HZ)
     w[3] = 3.0
     before, after = generalized_plant(A, B, C, w), generalized_plant(A + dA, B + dB, C + dC, w)
     changes = [after[i] - before[i] for i in (0, 2, 3, 4)]
@@ -65,7 +65,7 @@ def test_the_pull_back_of_an_unstable_plant(seed: int, p: int, count: int) -> No
     A = T @ np.diag(np.where(np.arange(n) < count, 1.0, -1.0) * (1.0 + np.arange(n))) @ T.T
     B, C = rng.normal(size=(n, m)), rng.normal(size=(p, n))
     dA, dB, dC = (0.1 * rng.normal(size=matrix.shape) for matrix in (A, B, C))
-    w = PAPER.scaled(100.0 * HZ)
+    w = PAPER.scale(100.0 * HZ)
     w[3] = 3.0
     here = unstable_modes(A, C)
     assert here is not None
@@ -147,7 +147,7 @@ def test_the_slope_of_the_bound_over_frequency(seed: int, p: int, at: float) -> 
 def test_the_place_of_the_bound_is_found_from_either_side(off: float) -> None:
     """Next to a sharp transmission zero; from too far away it is left where it is."""
     case = flexible_case(30)
-    arguments = (case.plant.A, case.plant.B, case.plant.C, case.weights.scaled(case.plant.omega_0))
+    arguments = (case.plant.A, case.plant.B, case.plant.C, case.weights.scale(case.plant.omega_0))
     start = gamma_lower_bound(
         prepare(*arguments[:3]), arguments[3], case.plant.grid, case.plant.gain
     )[1]

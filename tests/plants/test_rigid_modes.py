@@ -115,12 +115,15 @@ def test_free_motions_that_nothing_drives_or_reads_are_left_out_and_halves_are_r
 
 
 @settings(max_examples=10, deadline=None)
-@given(link=st.floats(8.0, 10.0), node=st.floats(-6.0, -4.0), soft=st.floats(6.0, 8.0))
+@given(apart=st.floats(1.5, 3.5), node=st.floats(-6.0, -4.0), soft=st.floats(6.0, 7.5))
 def test_the_loop_of_the_plant_as_written_keeps_its_slow_poles_beside_a_stiff_link(
-    link, node, soft
+    apart, node, soft
 ) -> None:
-    """In the chain's own coordinates double precision says that loops of this kind are unstable."""
-    masses, stiffness = np.array([100.0, 70.0, 10.0**node]), 10.0 ** np.array([soft, link])
+    """In the chain's own coordinates double precision says that loops of this kind are unstable.
+
+    Below a ratio of about 10 of both stiffnesses some are lost in any coordinates."""
+    masses = np.array([100.0, 70.0, 10.0**node])
+    stiffness = 10.0 ** np.array([soft, soft + apart])
     system = chain(masses, stiffness, damping=0.01)
     crossing = 0.1 * np.sqrt(10.0**soft / 100.0)
     gain, lead, slow = 170.0 * crossing**2, 3.0, 1e-3 * crossing

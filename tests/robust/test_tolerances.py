@@ -183,7 +183,7 @@ def test_the_count_is_the_same_for_any_workers_and_not_for_another_seed(uncertai
     def kept(machines: list[Machine]) -> list[bool]:
         return [point[column] < 0.012 for _, point in machines]
 
-    box: Any = SimpleNamespace(uncertain=uncertain, kept=kept)
+    box: Any = SimpleNamespace(uncertain=uncertain, find_kept=kept)
     plan, workers = Plan(0.9, 0.99), Backwards()
     one = certified_share(box, plan, {}, 3)
     assert one == certified_share(box, plan, {}, 3, workers)  # type: ignore[arg-type]

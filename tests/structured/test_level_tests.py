@@ -107,7 +107,7 @@ def test_what_no_proof_covers_is_not_passed(outcome: ProofOutcome) -> None:
     """A proof that does not apply or leaves bounds out says so, and its line is not passed."""
     for left in ("", "bounds of single channels are judged, not proven"):
         proof = Proof(outcome, 1e-3, ("shift",), {"KS": 1.0}, left=left, point=(0.1,),
-                      passed=("KS", 1.1))  # fmt: skip
+                      exceeded=("KS", 1.1))  # fmt: skip
         assert bool(proof.unproven) == (bool(left) or outcome in NOT_APPLICABLE)
         if proof.unproven and (proof.stable or outcome in NOT_APPLICABLE):
             assert "not proven" in proof.words

@@ -347,4 +347,4 @@ def test_every_figure_of_several_channels_is_proven_where_the_boxes_suffice() ->
     tight = replace(bounds, compliance_max=0.9 * bounds.compliance_max)
     refuted = prove(box, BOTH, KAPPA, 1.0, tight, LATE, slack=1e-3)
     assert refuted.outcome is ProofOutcome.REFUTED
-    assert refuted.passed[0] == "GS"
+    assert refuted.exceeded[0] == "GS"

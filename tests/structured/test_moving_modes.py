@@ -158,7 +158,7 @@ def test_a_bound_is_proven_for_the_whole_stroke_and_one_that_some_position_excee
     refuted = prove(BOX, STRUCTURE, KAPPA, 1.0, replace(BARE, S_max=0.99 * seen), LATE)
     assert refuted.outcome is ProofOutcome.REFUTED
     own = peak([(0, np.array(refuted.point))])
-    assert own >= refuted.passed[1] * 0.99 * seen * (1.0 - 1e-9)
+    assert own >= refuted.exceeded[1] * 0.99 * seen * (1.0 - 1e-9)
 
 
 def test_what_is_not_enclosed_is_named() -> None:

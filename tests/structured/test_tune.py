@@ -124,7 +124,7 @@ def test_every_form_of_a_plant_is_the_same_plant(tmp_path: Path) -> None:
     np.testing.assert_allclose([d.bandwidth / found[0].bandwidth for d in found], 1.0, rtol=1e-2)
 
 
-@pytest.mark.parametrize(("place", "wrong"), [(tuned_plants, "sampled"), (tuning, "realised")])
+@pytest.mark.parametrize(("place", "wrong"), [(tuned_plants, "zoh"), (tuning, "realise_blocks")])
 def test_what_a_search_gets_wrong_the_judge_refutes(
     monkeypatch: pytest.MonkeyPatch, place: ModuleType, wrong: str
 ) -> None:

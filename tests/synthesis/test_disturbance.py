@@ -181,7 +181,7 @@ def test_the_certificate_refuses_a_bound_below_the_norm_and_a_loop_without_its_d
     weights = replace(PAPER.at(100.0 * HZ, 1000.0 * HZ), disturbance=2e8)
     done = made(plant, weights)
     K = in_plant_units(plant, done.controller)
-    arguments = (plant.A, plant.B, plant.C, K.A, K.B, K.C, K.D, weights.scaled(plant.omega_0))
+    arguments = (plant.A, plant.B, plant.C, K.A, K.B, K.C, K.D, weights.scale(plant.omega_0))
 
     def code(delta: float, gamma: float) -> Code:
         row = np.full(int(Column.COUNT), np.nan)

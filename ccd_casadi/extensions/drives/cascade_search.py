@@ -166,9 +166,9 @@ def on_the_grid(
     fixed = np.zeros(len(values), bool)
     for i in np.argsort(-coarse).tolist():
         own, fixed[i] = settings[i], True
-        near = {own.rounded(values[i], by) for by in (-1, 0, 1)}
+        near = {own.round_value(values[i], by) for by in (-1, 0, 1)}
         if coarse[i] < options.fine:
-            near = {own.rounded(values[i])}
+            near = {own.round_value(values[i])}
         search.refine(values)
         found = []
         for value in sorted(near):

@@ -281,7 +281,7 @@ def _errors(
         u = (plant.force @ x)[:count]
         return np.asarray(u[np.arange(len(u)), np.abs(u).argmax(axis=1)])
 
-    shaped = [plant.shaped(found.found.shape) for plant in some]
+    shaped = [plant.with_taps(found.found.shape) for plant in some]
     old = [c.Curve(ms, left(plant, found.inverse), "" if i else "the model's inverse", GREY,
                    width=0.7) for i, plant in enumerate(some)]  # fmt: skip
     new = [c.Curve(ms, left(plant, found.found.x), "" if i else "this feedforward", BLUE,

@@ -55,7 +55,8 @@ def _plain(text: str) -> str:
 def split_unit(name: str) -> tuple[str, str]:
     """Part the name of a column from its unit, both in small letters; "" where there is no unit.
 
-    >>> parted("Position [mm]"), parted("force_command"), parted("pos_um"), parted("ActPosUm[0]")
+    >>> parts = "Position [mm]", "force_command", "pos_um", "ActPosUm[0]"
+    >>> tuple(map(split_unit, parts))
     (('position', 'mm'), ('force command', ''), ('pos', 'um'), ('actpos', 'um'))
     """
     name = re.sub(r"\[\d+\]$", "", name.strip())  # the number of an axis
