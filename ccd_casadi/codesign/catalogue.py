@@ -14,9 +14,6 @@ begin at what it has found.
 Where true values are cheap, exchanges give a combination to begin with (`exchange`): its design is
 judged before the first part is split, and cuts from there on if it is verified.
 
-Two parts are searched side by side, each by one worker, from what was known before both, unless the
-first would be a nearer place to begin the second at.
-
 Source: Land and Doig, Econometrica 28 (1960).
 """
 
@@ -35,7 +32,7 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import constraint_shares
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.inner_samples import with_all_spent
-from ccd_casadi.sampling.sampler import IndependentSearch, Sampler
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
@@ -43,9 +40,8 @@ from ccd_casadi.support.text import plural
 from ccd_casadi.support.time_budget import StageOptions, ends_early, stage
 
 Lists = dict[str, tuple[float, ...]]
-Searcher = Callable[[Sampler, Solution | None], Solution]
+Search = Callable[[Sampler, Solution | None], Solution]
 Judge = Callable[[Sampler, Solution], Solution]
-Learn = Callable[[Sequence[Solution]], None]
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,6 @@ class BranchOptions:
     on_value: float = 1e-6  # of a range: this close to a value of its list an optimum is on it
     no_better: float = 1e-6  # of the terms of J: a bound that is lower by less is cut
     few: int = 4  # combinations up to which all are searched: bounds would save no search
-    at_once: int = 2  # parts: of any number of workers, so that all find the same
     foreseen: float = 3600.0  # s: a longer time of searching every combination is not shown
     undecided: int = 12  # lists of which two values are tried where the time is up
 
@@ -119,19 +114,17 @@ def restrict(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -
 
 def best_of_lists(
     sampler: Sampler,
-    between: Searcher,
-    at: Searcher,
+    between: Search,
+    at: Search,
     judge: Judge | None = None,
     exchanges: bool = False,
-    learn: Learn = lambda found: None,
     options: BranchOptions = BranchOptions(),
 ) -> Solution:
     """The best co-design with every listed parameter on a value of its list.
 
-    `between` searches a part, `at` a combination, both near a solution that is given, in any
-    process; with `judge` what `at` finds is only good for its J, and the best is judged from there.
-    With `exchanges` the first combination is that of `best_exchange`. `learn` is given what was
-    searched side by side.
+    `between` searches a part, `at` a combination, both near a solution that is given; with `judge`
+    what `at` finds is only good for its J, and the best is judged from there. With `exchanges` the
+    first combination is that of `best_exchange`.
     """
     began, problem = perf_counter(), sampler.problem
     width = {name: high - low for name, low, high in
@@ -150,26 +143,8 @@ def best_of_lists(
     exchanged: Lists = {}
     judged, tried, count = 0, 0, open_[0].count
     most = count // 2 if count > options.few else 0
-
-    def place(p: _Part) -> tuple[bool, float, bool, float]:
-        return p.lost, p.bound, p.count > 1, away(p.lists, p.theta)
-
-    def in_full() -> bool:
-        """Whether parts are no longer bounded, but every combination of theirs is searched."""
-        return sum(not node.whole for node in nodes.values()) >= most
-
-    def near(p: _Part) -> Solution | None:
-        return min(known, key=lambda item: away(p.lists, _point(item)), default=None)
-
-    def nearer(p: _Part, other: _Part) -> bool:
-        """Whether a part is nearer to another one than to all that is known: from far away a search
-        near by may find nothing."""
-        gaps = [max(values[0] - other.lists[name][-1], other.lists[name][0] - values[-1], 0.0)
-                / width[name] for name, values in p.lists.items()]  # fmt: skip
-        return sum(gaps) < min(away(p.lists, _point(item)) for item in known)
-
     while open_:
-        part = min(open_, key=place)
+        part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
         least = np.inf  # a design that is not verified cuts nothing
         if best is not None and best.result["status"] == "verified":
             least = best.result["objective"] - _same(problem, best, options.no_better)
@@ -181,72 +156,46 @@ def best_of_lists(
         open_.remove(part)
         if part.lists == exchanged and part.found is None:
             continue  # it was searched before the first part was split
-        if part.count > 1 and in_full():
+        if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
             rows = product(*([(v,) for v in values] for values in part.lists.values()))
             open_ += [replace(part, lists=dict(zip(part.lists, row, strict=True))) for row in rows]
             continue
-        some = [part]
-        if known and part.found is None:
-            for other in sorted(open_, key=place)[: options.at_once - 1]:
-                of_the_kind = other.found is None and other.lost == part.lost
-                if not of_the_kind or other.bound >= least or other.lists == exchanged:
-                    break
-                if other.count > 1 and in_full():
-                    break
-                if judge is not None and nearer(other, part):
-                    break
-                some.append(other)
-                open_.remove(other)
+        own, whole = restrict(problem, part.lists), part.count == 1
+        near = min(known, key=lambda item: away(part.lists, _point(item)), default=None)
+        each = sampler.of(own, traced=whole)
         if judge is not None and part.found is not None:
-            each = sampler.of(restrict(problem, part.lists))
-            founds, judged = [judge(each, part.found)], judged + 1
-        elif len(some) > 1:
-            founds = sampler.side_by_side([
-                IndependentSearch(
-                    at if p.count == 1 else between, restrict(problem, p.lists), near(p),
-                    traced=p.count == 1,
-                )
-                for p in some
-            ])  # fmt: skip
-            learn(founds)
+            found, judged = judge(each, part.found), judged + 1
         else:
-            each = sampler.of(restrict(problem, part.lists), traced=part.count == 1)
-            founds = [(at if part.count == 1 else between)(each, near(part))]
-            learn(founds)
-        lowered = 0.0
-        for part, found in zip(some, founds, strict=True):
-            own, whole = restrict(problem, part.lists), part.count == 1
-            found = replace(found, problem=found.problem or own)
-            J = found.result.get("objective", np.inf)
-            node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
-            nodes[tuple(part.lists.values())] = node
-            gained = part.bound - lowered - J if node.status != "not_verified" else 0.0
-            same = _same(problem, found, options.no_better)
-            if gained > same:  # as little as that bound are other ends the least of their parts
-                known.clear()
-            known += [found] if np.isfinite(J) else []
-            if gained > same or (part.found and -gained > same):
-                lower = 2.0 * max(gained, 0.0)
-                lowered += lower
-                open_ = [replace(other, bound=other.bound - lower, found=None) for other in open_]
-            if whole and judge is not None and part.found is None and np.isfinite(J):
-                open_.append(replace(part, bound=J, found=found))
-            elif whole:
-                best = found if best is None else min(best, found, key=order)
-            elif np.isfinite(J):
-                theta = _point(found)
-                open_ += [
-                    _Part(child, J, theta)
-                    for child in _children(width, part.lists, theta, options.on_value)
-                ]
-            else:
-                open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
+            found = (at if whole else between)(each, near)
+        found = replace(found, problem=found.problem or own)
+        J = found.result.get("objective", np.inf)
+        node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
+        nodes[tuple(part.lists.values())] = node
+        gained = part.bound - J if node.status != "not_verified" else 0.0
+        same = _same(problem, found, options.no_better)
+        if gained > same:  # as little as that bound are other ends the least of their parts
+            known.clear()
+        known += [found] if np.isfinite(J) else []
+        if gained > same or (part.found and -gained > same):
+            lower = 2.0 * max(gained, 0.0)
+            open_ = [replace(other, bound=other.bound - lower, found=None) for other in open_]
+        if whole and judge is not None and part.found is None and np.isfinite(J):
+            open_.append(replace(part, bound=J, found=found))
+        elif whole:
+            best = found if best is None else min(best, found, key=order)
+        elif np.isfinite(J):
+            theta = _point(found)
+            open_ += [
+                _Part(child, J, theta)
+                for child in _children(width, part.lists, theta, options.on_value)
+            ]
+        else:
+            open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
         if exchanges and len(nodes) == 1 and not whole and np.isfinite(J):
             of = each.of(found.problem or own) if judge else each  # with its warm starts
             exchanged, tried = _exchange(problem, of, found, options)
             own = restrict(problem, exchanged)
             first = at(sampler.of(own), found)
-            learn([first])
             first = replace(first, problem=first.problem or own)
             J = first.result.get("objective", np.inf)
             words = _made_of(problem, first.result)
@@ -260,7 +209,7 @@ def best_of_lists(
         remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
     if best is None:  # the time was up
         with stage(StageOptions.ending):
-            best, lists = _in_the_time_left(sampler, at, judge, learn, open_, known, options)
+            best, lists = _in_the_time_left(sampler, at, judge, open_, known, options)
         name, J = best.result["status"], best.result.get("objective", np.inf)
         node = Node(lists, name, J, _made_of(problem, best.result))
         nodes[tuple(lists.values())] = node
@@ -287,7 +236,7 @@ def _exchange(
 
 
 def _in_the_time_left(
-    sampler: Sampler, at: Searcher, judge: Judge | None, learn: Learn, open_: Sequence[_Part],
+    sampler: Sampler, at: Search, judge: Judge | None, open_: Sequence[_Part],
     known: Sequence[Solution], options: BranchOptions,
 ) -> tuple[Solution, Lists]:  # fmt: skip
     """The design of one combination: of the best that was found, else the nearest to what was."""
@@ -302,7 +251,6 @@ def _in_the_time_left(
     lists = _nearest(problem, theta if best is None else theta | _point(best), options)
     own = restrict(problem, lists)
     solution = at(sampler.of(own), best)
-    learn([solution])
     if judge is not None and np.isfinite(solution.result.get("objective", np.inf)):
         solution = judge(sampler.of(own), replace(solution, problem=solution.problem or own))
     return replace(solution, problem=solution.problem or own), lists

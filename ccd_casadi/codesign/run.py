@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -283,10 +282,10 @@ def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution
     if isinstance(sampler.problem.controller, StructuredProblem):
         from ccd_casadi.codesign.structured_lists import ListedStructured
 
-        of = ListedStructured(formulation, seed, partial(_whole, formulation, seed))
-        best = best_of_lists(
-            sampler, of.between, of.search, of.judge, exchanges=True, learn=of.learn
+        of = ListedStructured(
+            formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
         )
+        best = best_of_lists(sampler, of.between, of.search, of.judge, exchanges=True)
         if best.verified is None:  # a search near by knows nothing of the run
             whole = infeasible_dict(terms, best.result["reason"], sampler.spent.by_purpose)
             best = replace(best, result={**whole, "listed": best.result["listed"]})
@@ -294,17 +293,7 @@ def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box
     return best_of_lists(
         sampler,
-        partial(_anywhere, quick, seed),
-        partial(_anywhere, formulation, seed),
+        lambda each, near: co_design(each, quick, seed),
+        lambda each, near: co_design(each, formulation, seed),
         exchanges=True,
     )
-
-
-def _whole(formulation: Formulation, seed: int, sampler: Sampler, known: Array) -> Solution:
-    """`co_design` with its sampler last but for x: a function that another process can be given."""
-    return co_design(sampler, formulation, seed, known=known)
-
-
-def _anywhere(formulation: Formulation, seed: int, sampler: Sampler, near: object) -> Solution:
-    """`co_design` as `_whole`, from no solution near by."""
-    return co_design(sampler, formulation, seed)

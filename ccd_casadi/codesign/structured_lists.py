@@ -7,9 +7,8 @@ part is not empty for that. What is found so is good for its J; the best combina
 designed as any other case, from that controller.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import cast
 
 import casadi as ca
@@ -73,7 +72,7 @@ class ListedOptions:
 
 @dataclass
 class ListedStructured:
-    """`between`, `search`, `judge` and `learn` as `best_of_lists` requires them.
+    """`between`, `search` and `judge` as `best_of_lists` requires them.
 
     `solve` continues from a θ to a whole co-design. `scenarios`: all plants that were found worse
     than those of the set, at any of the θ.
@@ -97,13 +96,10 @@ class ListedStructured:
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
             return _nothing(forbidden)
-        return self._anew(sampler, settled) if near is None else self._near(sampler, near, settled)
-
-    def learn(self, found: Sequence[Solution]) -> None:
-        """The plants of what was searched side by side, for the searches that follow."""
-        each = [state_of(one.problem).scenarios for one in found if one.problem is not None]
-        if each:
-            self.scenarios = tuple(dict.fromkeys(chain(*each)))
+        found = self._anew(sampler, settled) if near is None else self._near(sampler, near, settled)
+        if found.problem is not None:
+            self.scenarios = state_of(found.problem).scenarios
+        return found
 
     def _anew(self, sampler: Sampler, settled: float | None) -> Solution:
         outer = StructuredOuter(sampler).prepare(self.seed)

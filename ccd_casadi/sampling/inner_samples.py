@@ -71,16 +71,6 @@ class SynthesisCounts:
         return new
 
     @property
-    def units(self) -> dict[str, tuple[str, int]]:
-        """Purpose and count of every unit of work, in the order in which they came up."""
-        return dict(self._units)
-
-    def add(self, units: Mapping[str, tuple[str, int]]) -> None:
-        """Count units of another process, each once."""
-        for unit, counted in units.items():
-            self._units.setdefault(unit, counted)
-
-    @property
     def total(self) -> int:
         """The number for all purposes."""
         return sum(count for _, count in self._units.values())

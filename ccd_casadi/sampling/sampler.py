@@ -6,10 +6,9 @@ end is stored whole (`kept`), with the controller, as it is made.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -36,11 +35,10 @@ from ccd_casadi.sampling.units import (
     solve_in_time,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.lent_pool import LentWorkers
-from ccd_casadi.support.process_pool import Pool, Workers, results
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress, remark
 from ccd_casadi.support.text import HZ
-from ccd_casadi.support.time_budget import TimeBudget, budget, continued, not_searched, time_is_up
+from ccd_casadi.support.time_budget import not_searched, time_is_up
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 T = TypeVar("T")
@@ -64,36 +62,6 @@ class TraceEntry:
     theta: tuple[float, ...]
     bandwidth: float
     objective: float
-
-
-@dataclass(frozen=True)
-class IndependentSearch:
-    """A search that depends on no other.
-
-    Attributes
-    ----------
-    run : callable
-        Of a sampler of the problem, and of `given`, in any process.
-    problem : CoDesignProblem
-    given : object
-    traced : bool
-        As of `Sampler.of`.
-    """
-
-    run: Callable[["Sampler", Any], Any]
-    problem: CoDesignProblem
-    given: Any
-    traced: bool
-
-
-@dataclass(frozen=True)
-class _Record:
-    """What a sampler has counted and traced, for one of another process to begin with."""
-
-    purpose: str
-    units: dict[str, tuple[str, int]]
-    trace: tuple[TraceEntry, ...]
-    bandwidth_at_start: float | None
 
 
 class Sampler:
@@ -163,38 +131,6 @@ class Sampler:
         if traced:
             other.trace, other.bandwidth_at_start = self.trace, self.bandwidth_at_start
         return other
-
-    def side_by_side(self, searches: Sequence[IndependentSearch]) -> list[Any]:
-        """What searches find that do not depend on each other, in their order: each is made by one
-        worker, on the same store.
-
-        Each begins with the record of this run, and what it adds joins that in their order, so that
-        all is the same for any number of workers. Those of a cluster have no such store: they share
-        each.
-        """
-        own, spent = budget(), self.spent
-        record = _Record(spent.purpose, spent.units, tuple(self.trace), self.bandwidth_at_start)
-        path = self.store.path.absolute()
-        tasks = {i: (one, path, record, TimeBudget(own.minutes, own.began))
-                 for i, one in enumerate(searches)}  # fmt: skip
-        if isinstance(self.workers, Workers):
-            done = dict(results(self.workers, _alone, tasks))
-        else:
-            done = {i: _alone(*task, self.workers) for i, task in tasks.items()}
-        before = spent.total
-        for i, search in enumerate(searches):
-            _, units, trace, left = done[i]
-            more = spent.total - before  # of the searches before it
-            spent.add(units)
-            own.with_left_of(left)
-            if not search.traced:
-                continue
-            known = trace[: len(record.trace)]
-            if known and np.isnan([entry.objective for entry in known]).all():  # on worse plants
-                self.trace[:] = [replace(e, bandwidth=np.nan, objective=np.nan) for e in self.trace]
-            self.trace += [replace(entry, syntheses=entry.syntheses + more)
-                           for entry in trace[len(known) :]]  # fmt: skip
-        return [done[i][0] for i in tasks]
 
     @property
     def syntheses(self) -> int:
@@ -398,21 +334,3 @@ class Sampler:
 
     def _design_key(self, x: tuple[float, ...]) -> str:
         return sample_key(self.hash, x[:-2], *self.problem.inner.frequencies(x))
-
-
-def _alone(
-    search: IndependentSearch,
-    path: Path,
-    record: _Record,
-    own: TimeBudget,
-    workers: Pool | None = None,
-) -> tuple[Any, dict[str, tuple[str, int]], list[TraceEntry], TimeBudget]:  # fmt: skip
-    """A search by a sampler of its own: what it finds, its units and trace, and what was left."""
-    with continued(own), SampleStore(path) as store, LentWorkers() as one:
-        sampler = Sampler(search.problem, store, workers or one)
-        sampler.spent.add(record.units)
-        sampler.spent.purpose, sampler.whole = record.purpose, search.traced
-        if search.traced:
-            sampler.trace, sampler.bandwidth_at_start = [*record.trace], record.bandwidth_at_start
-        found = search.run(sampler, search.given)
-        return found, sampler.spent.units, sampler.trace, own

@@ -66,11 +66,6 @@ class TimeBudget:
         """The end of a share of it, s of `time.monotonic`."""
         return self.began + share * 60.0 * self.minutes
 
-    def with_left_of(self, other: "TimeBudget") -> None:
-        """Note what a search of this budget has left in another process."""
-        self.left.update(other.left)
-        self.share = max(self.share, other.share)
-
     @property
     def ended(self) -> bool:
         """Whether it ended a search that would have gone on."""
@@ -108,21 +103,10 @@ def within_budget(minutes: float | None) -> Iterator[TimeBudget]:
     minutes : float or None
     """
     made = TimeBudget(math.inf if minutes is None else minutes)
-    with continued(made), until(made.until(StageOptions.search)):
-        yield made
-
-
-@contextmanager
-def continued(own: TimeBudget) -> Iterator[None]:
-    """Within the block the budget is one that began elsewhere.
-
-    Parameters
-    ----------
-    own : TimeBudget
-    """
-    before = _BUDGET.set(own)
+    before = _BUDGET.set(made)
     try:
-        yield
+        with until(made.until(StageOptions.search)):
+            yield made
     finally:
         _BUDGET.reset(before)
 

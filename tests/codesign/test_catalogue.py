@@ -151,9 +151,6 @@ class OneSampler(SimpleNamespace):
     def of(self, other: CoDesignProblem, *, traced: bool = True) -> "OneSampler":
         return OneSampler(problem=other)
 
-    def side_by_side(self, searches: list[Any]) -> list[Any]:
-        return [each.run(self.of(each.problem), each.given) for each in searches]
-
 
 def two_lists(rng: np.random.Generator) -> CoDesignProblem:
     lists = {
@@ -336,7 +333,8 @@ def test_a_run_is_of_the_value_that_was_chosen(listed_run: Path) -> None:
     assert result["objective"] < heavier.result["objective"]
 
 
-def test_searches_side_by_side_find_and_count_the_same_with_any_number_of_workers(
+@pytest.mark.slow
+def test_a_search_of_lists_finds_and_counts_the_same_with_any_number_of_workers(
     tmp_path: Path,
 ) -> None:
     """And all is in the store: a run that is repeated on it makes no synthesis."""
@@ -344,17 +342,10 @@ def test_searches_side_by_side_find_and_count_the_same_with_any_number_of_worker
         names=("m1", "m2"), units=("kg",) * 2, start=(60.0, 62.0), lower=(56.0, 58.0),
         upper=(64.0, 66.0), listed=(("m1", (56.0, 60.0, 64.0)),),
     )  # fmt: skip
-    sizes: list[int] = []
-
-    class Watched(Sampler):
-        def side_by_side(self, searches: Any) -> list[Any]:
-            sizes.append(len(searches))
-            return super().side_by_side(searches)
-
     found = []
     for count, file in ((1, "one"), (2, "two"), (2, "one")):
         with Workers(count) as pool, SampleStore(tmp_path / f"{file}.sqlite") as store:
-            before, sampler = store.count(), Watched(own, store, pool)
+            before, sampler = store.count(), Sampler(own, store, pool)
             quick = Lifted(points=8, box_points=0, starts=2, max_refinements=1)
             best = co_design(sampler, quick, 0)
             lists, theta = best.result["listed"], best.result["theta"]
@@ -364,7 +355,6 @@ def test_searches_side_by_side_find_and_count_the_same_with_any_number_of_worker
             steps = [entry.syntheses for entry in sampler.trace]
             assert steps == sorted(steps)
             assert steps[-1] == sampler.syntheses
-    assert sizes == [2, 2, 2]
     assert found[0] == found[1] == found[2]
 
 
