@@ -172,7 +172,7 @@ class RibStage:
     `truncation`: "symmetry" keeps `modes` of each symmetry, so that crossing frequencies do not
     make the model jump; "frequency" keeps as many of the lowest of all. A stage whose point
     masses break the square has no symmetries and is truncated by frequency. `fading` modes more of
-    each of its groups count in part, see `truncation.faded`: the plant does not jump where the last
+    each of its groups count in part, see `fade`: the plant does not jump where the last
     one kept and the next, whose shapes the masses couple, nearly meet.
     """
 
