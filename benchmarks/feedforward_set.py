@@ -22,7 +22,8 @@ from ccd_casadi.extensions.feedforward.move_responses import (
     least_error,
     responses_of,
 )
-from ccd_casadi.extensions.feedforward.set_feedforward import profile_of, set_feedforward
+from ccd_casadi.extensions.feedforward.set_feedforward import set_feedforward
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.solve import main as solve_main
 
 ROOT = Path(__file__).parents[1]
@@ -44,9 +45,8 @@ def case_text() -> str:
 def shown(folder: Path) -> None:
     """One setpoint."""
     run = read_run(folder)
-    known = profile_of(run)
-    assert known is not None
-    profile, window = known
+    motion = motion_of(run.problem, run.theta)
+    profile, window = motion.cycle.profile, motion.motion.window
     found = set_feedforward(run, profile, window)
     shape, x = found.found.shape, found.found.x
     heat = 100.0 * found.heat / found.limits.heat

@@ -133,14 +133,14 @@ class Controls:
         for each in (*self._theta, *of_search, self.shift, self.rate, self.delay):
             self._heard(each, changed, each in of_search)
         for chosen, what in ((self.structure, "value"), (self.sampled, "active")):
-            chosen.on_change(what, lambda attr, old, new: self._tell(changed, True, True))
+            chosen.on_change(what, lambda attr, old, new: self._report(changed, True, True))
         self._hide()
 
     def _heard(self, moved: Any, changed: Any, search: bool) -> None:
-        moved.on_change("value", lambda attr, old, new: self._tell(changed, False, search))
-        moved.on_change("value_throttled", lambda attr, old, new: self._tell(changed, True, True))
+        moved.on_change("value", lambda attr, old, new: self._report(changed, False, search))
+        moved.on_change("value_throttled", lambda attr, old, new: self._report(changed, True, True))
 
-    def _tell(self, changed: Any, let_go: bool, search: bool) -> None:
+    def _report(self, changed: Any, let_go: bool, search: bool) -> None:
         if let_go:
             self._hide()
         if not self.quiet:

@@ -235,11 +235,11 @@ def price_answer(run: FinishedRun, sampler: Sampler, quiet: bool) -> Answer:
     if table.cost_per_percent is None:
         return Answer(entry, tuple(words), True, {})
 
-    def tell_of(one: Bought) -> None:
+    def report_bought(one: Bought) -> None:
         log(f"J = {number(one.objective, 7)} at {_widths_words(one)}")
 
     best = buy(sampler, run.theta, run.kappa, table.cost_per_percent, table.half_width or {},
-               tell_of)  # fmt: skip
+               report_bought)  # fmt: skip
     if best is None:
         words.insert(0, "widths        the run's design was not found again")
         return Answer(entry, tuple(words), False, {})
