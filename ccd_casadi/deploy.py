@@ -99,7 +99,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if moved is not None:
         last = list(moved.ways)[-1]
         far = with_unit(moved.ways[last].position[-1], spoken("m"))
-        inform(f"{'a move':13s} of {far}, {way_words(last, [moved.ways[last]])}")
+        inform(f"{'a move':13s} of {far} on the model, {way_words(last, [moved.ways[last]])}")
     page = deploy_page(run, found, moved, index_of(folder))
     publish(run.folder, folder / "report.html", page)
     inform(f"page          {folder / 'report.html'}")

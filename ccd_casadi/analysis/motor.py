@@ -258,8 +258,9 @@ class MotionAt:
         Its cycle, and those with each parameter a step along the imaginary axis away.
     forward, forward_slopes : (5, m), (n_θ, 5, m) array
         Feedforward per derivative of the setpoint, and its derivatives to θ.
-    held : bool
-        Whether a spring or a magnet holds the output, so that the cycle counts `forward[0]`.
+    inertia, holding : (m,) array, (m,) array or None
+        g and h of the machine itself, without hold, delay, amplifiers and filters; None: nothing
+        holds the output.
     """
 
     motion: Motion
@@ -268,12 +269,13 @@ class MotionAt:
     stepped: tuple[Cycle, ...]
     forward: Array
     forward_slopes: Array
-    held: bool = False
+    inertia: Array
+    holding: Array | None = None
 
     def body_forces(self, r: Array) -> Array:
         """The forces (N, m) of a setpoint (5, N) that the cycle counts: g r̈, and h r if held."""
-        forces = np.outer(r[2], self.forward[2])
-        return forces + np.outer(r[0], self.forward[0]) if self.held else forces
+        forces = np.outer(r[2], self.inertia)
+        return forces if self.holding is None else forces + np.outer(r[0], self.holding)
 
     def forward_force(self, sampling: Sampling | None) -> float:
         """The largest force of the feedforward on any motor, with all its terms.
@@ -317,17 +319,20 @@ def motion_at(
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
     ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
-    found = cycle_of(motion, ahead[2], mass)
-    held = np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force
-    if held:
-        found = cycle_of(motion, ahead[2], mass, ahead[0])
+    g, dg, h, dh = ahead[2], slopes[:, 2], None, slopes[:, 0]
+    found = cycle_of(motion, g, mass)
+    if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
+        body = free.mechanics or free  # what is late or filtered adds to F₂ where F₀ is not zero
+        F, dF = feedforward_slopes(body.plant_si(), body.changes_si(), 0.0, 0.0)
+        g, dg, h, dh = F[2, :, 0], dF[:, 2, :, 0], F[0, :, 0], dF[:, 0, :, 0]
+        found = cycle_of(motion, g, mass, h)
     step = 1j * options.complex_step
     stepped = tuple(
-        cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place),
-                 ahead[0] + step * slope[0] if held else None)
-        for i, slope in enumerate(slopes)
+        cycle_of(motion, g + step * dg[i], mass + step * (i == place),
+                 None if h is None else h + step * dh[i])
+        for i in range(len(slopes))
     )  # fmt: skip
-    return MotionAt(motion, mass, found, stepped, ahead, slopes, bool(held))
+    return MotionAt(motion, mass, found, stepped, ahead, slopes, g, h)
 
 
 class DrivenMechanics:

@@ -87,6 +87,11 @@ class ControllerProblem:
     kernels: ClassVar[tuple[str, ...]] = ()
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of a result must know of it."""
+        return ()
+
+    @property
     def figure(self) -> FigureOfMerit:
         """The figure of the controller that J counts."""
         return BANDWIDTH

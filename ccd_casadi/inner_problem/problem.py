@@ -204,10 +204,11 @@ def notes_of(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[str, ...
     Returns
     -------
     tuple of str
-        Its own notes, and the damping that modes lose in a mixed synthesis.
+        Its own notes, those of its controller, and the damping that modes lose in a mixed
+        synthesis.
     """
     plant, ratio = plant_of(problem), problem.suspension.undamped
-    notes = plant.notes(theta)
+    notes = (*plant.notes(theta), *problem.controller.notes)
     if not isinstance(problem.controller, MixedSensitivityProblem):
         return notes
     if not require_damping(free_modal(problem, mechanics(plant, theta, derivatives=False))):

@@ -133,7 +133,8 @@ def cycle_chapter(
                               levels=(here,)))  # fmt: skip
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
-    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, found.held)
+    held = found.holding is not None
+    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held)
     words = paragraph("report.cycle", shown, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]

@@ -72,7 +72,8 @@ class Statics:
         """One or two sentences."""
         low = f"{spoken('1 N')} at {self.low_hz:.3g} Hz moves it {with_unit(self.low, spoken('m'))}"
         if np.isinf(self.stiffness):  # a pole at rest
-            moved = f"moves it {with_unit(self.compliance, spoken('m'))}, beyond the sensors"
+            size = with_unit(self.compliance, spoken("m"))
+            moved = f"of {spoken('1 N')} moves it {size}, beyond the sensors"
             held = moved if self.compliance else "does not move the stage"
             return f"The controller integrates: a constant force {held}; {low}."
         found = "" if np.isfinite(self.share) else "Not every channel integrates. "

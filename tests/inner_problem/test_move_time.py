@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,15 @@ from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.motor import Motion, MotionAt, MotionOptions, Motor, cycle_of, with_motion
+from ccd_casadi.analysis.motor import (
+    DrivenMechanics,
+    Motion,
+    MotionAt,
+    MotionOptions,
+    Motor,
+    cycle_of,
+    with_motion,
+)
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.analysis.setpoint import setpoint
@@ -217,6 +226,9 @@ def test_a_held_plant_has_its_motor_limits_with_slopes(sign: float) -> None:
     force = sign * 2e4 * r[0] + 1.7 * r[2]
     most = max(np.abs(force).max(), 2e4 * 0.002)
     assert value[0] == pytest.approx(most / 300.0 - 1.0, abs=1e-4)  # the spring gives 5e-5
+    late = cast(DrivenMechanics, held.evaluate).at(tuple(theta), Sampling(4000.0, 500.0))
+    shares = late.cycle.peak_share, late.cycle.heat_share  # of the machine, whatever hold and delay
+    assert np.subtract(shares, 1.0) == pytest.approx(value, rel=1e-9)
     for row, number in zip(hardware_slopes(held, theta)[1], range(2), strict=True):
         numeric = slopes(
             lambda s, i=number: constraint_values(held, s * theta)[[i]], np.ones(2), 1e-4
@@ -323,7 +335,7 @@ def test_the_force_that_is_printed_is_that_of_all_terms_of_the_feedforward(held:
     limits = MoveLimits(0.35, 2.0, 40.0, 4000.0, 1e7)
     forces = np.array([[0.0], [0.0], [0.02], [8e-6], [-2.0622e-8]])
     cycle = cycle_of(moving(MOTOR, limits), forces[2])
-    at = MotionAt(moving(MOTOR, limits), 0.0, cycle, (), forces, np.zeros((1, 5, 1)))
+    at = MotionAt(moving(MOTOR, limits), 0.0, cycle, (), forces, np.zeros((1, 5, 1)), forces[2])
     found = at.forward_force(Sampling(25000.0, 0.0) if held else None)
     t = np.linspace(0.0, cycle.profile.duration, 200001)
     truth = np.abs(cycle.profile.at(t).T @ forces).max()
