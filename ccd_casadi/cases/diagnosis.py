@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis import MOTOR_LIMITS
 from ccd_casadi.cases.findings import (
     CaseFinding,
     Severity,
@@ -50,7 +51,7 @@ from ccd_casadi.plants.plant_facts import PlantFacts, facts_of
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.terminal import Progress
-from ccd_casadi.support.text import is_force, number, of_newtons, spoken
+from ccd_casadi.support.text import is_force, number, of_newtons, plural, spoken
 
 
 def points_to_check(
@@ -143,7 +144,7 @@ def diagnose(
             findings += [replace(item, index=index) for item in here]
             facts.append(found)
         progress.advance()
-    findings = most_limiting(findings)
+    findings = [*most_limiting(findings), *_unmet(plant, facts)]
     counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
     if len(counts) > 1 and rigid_modes is None:
         words = (
@@ -153,6 +154,24 @@ def diagnose(
         )
         findings.append(CaseFinding(Severity.WARNING, Topic.RIGID_MODES, words))
     return tuple(facts), tuple(findings)
+
+
+def _unmet(plant: Plant, facts: Sequence[PlantFacts]) -> list[CaseFinding]:
+    """Warn of constraints that none of the examined points meets."""
+    if not facts or not plant.constraint_names:
+        return []
+    least = np.min([constraint_values(plant, item.theta) for item in facts], axis=0)
+    found = []
+    for name, value in zip(plant.constraint_names, least.tolist(), strict=True):
+        if not value > 0.0:
+            continue
+        words = f"constraint {name} is met at none of {plural(len(facts), 'point')} of the box"
+        size = f"its least value is {value:.4g}"
+        if name in MOTOR_LIMITS:
+            size = f"the move needs {value + 1.0:.4g} times what the motor allows, or more"
+        found.append(CaseFinding(Severity.WARNING, Topic.UNITS, f"{words}: {size}; is a number in "
+                                 "another unit, or are the bounds too narrow?"))  # fmt: skip
+    return found
 
 
 def _unused_parameters(

@@ -406,3 +406,14 @@ def test_what_varies_is_looked_at_to_its_ends() -> None:
     varied = {point.theta[len(problem.names)] for point in facts}
     assert {low, high} <= varied, name
     assert facts[0].theta[: len(problem.names)] == problem.start
+
+
+@pytest.mark.parametrize(("least", "warned"), [("1e9", True), ("0", False)])
+def test_a_constraint_that_no_point_meets_is_warned_of(
+    tmp_path: Path, least: str, warned: bool
+) -> None:
+    path = case_file(tmp_path, GOOD + f"|{{'constraints': {{'too light': {least} - t['m1']}}}}")
+    found = [item.words for item in diagnose(problem_of(load_case(path)))[1]
+             if "too light" in item.words]  # fmt: skip
+    assert len(found) == warned
+    assert not warned or "met at none of" in found[0]
