@@ -233,7 +233,7 @@ class RobustTable:
         check=checks.number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
     gain: float = key(
-        "sections: largest error of the plant's gain, as a share",
+        "sections: largest error of what u moves, as a share",
         0.0,
         check=checks.number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
     )

@@ -21,6 +21,7 @@ import numpy as np
 from ccd_casadi.codesign.survival import PEAK, LoopsOffModel, Survival, excess_of, highest, survival
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
+from ccd_casadi.fixed_structure.uncertainty import with_forces_of_model
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -318,9 +319,13 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     def judged(of: LoopsOffModel) -> SetCertificate:
         plants = []
         for place, gain in product(places, sorted(set(gains))):
-            modal = (of.at_ports or of).modal(place).scale_input(gain)
-            plants.append(scale_plant(modal, problem.weights.M_K, bare=True) if of.own is None
-                          else scale_at_ports(modal, problem.weights.M_K, of.own))  # fmt: skip
+            own = of.own
+            inputs = None if own is None else own.inputs
+            modal = (of.at_ports or of).modal(place).scale_input(gain, inputs)
+            plant = (scale_plant(modal, problem.weights.M_K, bare=True) if own is None
+                     else scale_at_ports(modal, problem.weights.M_K, own))  # fmt: skip
+            at_u = inputs in (None, modal.B.shape[1])
+            plants.append(with_forces_of_model(plant, gain) if at_u else plant)
         return certify(plants, of.controller, bounds, of.sampling)
 
     kept = "matrix" if loops.given else "ratio"

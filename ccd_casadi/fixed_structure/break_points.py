@@ -164,7 +164,8 @@ class SensorFamily(LoopFamily):
         if self.bounds.compliance_max is not None:
             upper, lower = _compliance(numbers, at_actuator, free, error)
             limit = self.bounds.compliance_max * inside
-            found.append(("GS", upper / limit, lower / limit))
+            weakest, strongest = self._strength(boxes)
+            found.append(("GS", upper / (limit * weakest), lower / (limit * strongest)))
         names, tops, least = zip(*found, strict=True)
         good = finite & figures[-1][3]
         highest = np.where(good & ~np.isnan(tops), tops, np.inf)

@@ -186,7 +186,8 @@ class LoopFamily:
             figures["GS"] = self._moved(loop) if elsewhere else loop.GS()
             upper, lower, *_ = figures["GS"]
             limit = self._inside(boxes) * (1.0 if elsewhere else compliance)
-            found.append(("GS", upper / limit, lower / limit))
+            least, most = self._strength(boxes)
+            found.append(("GS", upper / (limit * least), lower / (limit * most)))
         names, most_at, least_at = zip(*found, strict=True)
         highest, lowest = np.array(most_at), np.array(least_at)
         highest = np.where(loop.good & ~np.isnan(highest), highest, np.inf)
@@ -333,11 +334,12 @@ class LoopFamily:
             y_most = axis.y.size**2
             grain_of = epsilon * np.abs(K[:, 0, 0]) + grain
             most, *_ = self._force_discs((m_y, r_y, g_y, e_y), K, grain_of, self._y(axis), y_most)
-            found.append(("GS", most / self._inside(boxes), none))
+            found.append(("GS", most / self._inside(boxes) / self._strength(boxes)[0], none))
         elif compliance is not None:
             G = (np.abs(g) + e) * row_lengths(c) * row_lengths(self.plant.pushed)
             NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
             GS = y_max * a2 / n * NG / (compliance * self._inside(boxes))
+            GS /= self._strength(boxes)[0]
             found.append(("GS", GS, none))
         most_at = np.array([most_of for _, most_of, _ in found])
         highest = np.where(good & np.isfinite(most_at), most_at, np.inf)
@@ -403,6 +405,15 @@ class LoopFamily:
     def _inside(self, boxes: Boxes) -> Array:
         """1, and infinite at the point that is not part of the axis."""
         return np.where(boxes.chart == Chart.POINT, np.inf, 1.0)
+
+    def _strength(self, boxes: Boxes) -> tuple[Array, Array]:
+        """1 + p_gain at least and at most: what a force moves is enclosed as that many times as
+        large, as `ModalSum.strength` is of both b_i and f_i."""
+        if "gain" not in self.names:
+            one = np.ones(len(boxes.chart))
+            return one, one
+        row = 1 + self.names.index("gain")
+        return (1.0 + boxes.low[row]) * (1.0 - GUARD), (1.0 + boxes.high[row]) * (1.0 + GUARD)
 
     def _of_S(self, boxes: Boxes, S: Range, a2: Array) -> list[tuple[str, Array, Array]]:
         """(name, figure over its bound at most, at least) of every bound on S; ‖S/y‖ <= `a2`.

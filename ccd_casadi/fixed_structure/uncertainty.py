@@ -2,7 +2,9 @@
 
 A point p of the box is a vector; with the option sets of the plant it makes one scaled plant.
 Frequencies of flexible modes are multiplied by (1 + p_common)(1 + p_mode), modal damping ratios by
-the damping factor, the whole plant by 1 + p_gain. Mode shapes stay, and free bodies stay free.
+the damping factor, what u moves by 1 + p_gain: the force constant of an actuator, or the scale of a
+sensor, of which the loop knows the product alone. Disturbing forces move the machine as they do on
+the model. Mode shapes stay, and free bodies stay free.
 
 For a proof it is a sum of modes, poles and residues as affine forms of what is uncertain:
 
@@ -22,8 +24,8 @@ from scipy.linalg import hadamard
 
 from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.lti.wiring import OwnPorts, Slopes
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.lti.wiring import ForcedPlant, OwnPorts, Slopes
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.first_order import FirstOrderPlant
 from ccd_casadi.plants.modal import (
@@ -56,7 +58,7 @@ class UncertainPlant:
     M_K : float
         N/m: scales all of them alike.
     resonance_shift, mode_shift, gain : float
-        Relative, to either side: of all modes, of each, and of the plant; 0: none.
+        Relative, to either side: of all modes, of each, and of what u moves; 0: none.
     damping : tuple of two floats
         The least and the largest factor on modal damping.
     ranges : tuple of (name, least, nominal, largest)
@@ -69,6 +71,8 @@ class UncertainPlant:
         How many, where that is stated.
     own : OwnPorts, optional
         Of options whose further inputs and outputs are where forces act and what counts.
+    inputs : int, optional
+        How many inputs are those of u, the first; None: all.
     """
 
     options: tuple[Mechanics, ...]
@@ -82,6 +86,7 @@ class UncertainPlant:
     graph: Callable[[int], ca.Function | None] = no_graph
     rigid_modes: int | None = None
     own: OwnPorts | None = None
+    inputs: int | None = None
 
     @cached_property
     def modes(self) -> int:
@@ -144,14 +149,31 @@ class UncertainPlant:
             if (states := modal.states) is not None:
                 dA, dB, dC = (d[:-count] for d in states.slopes)
                 own = Slopes(dA, dB, dC)
-                return self._scaled(replace(modal, states=replace(states, slopes=own)))
-            modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
-        return self._scaled(modal)
+                modal = replace(modal, states=replace(states, slopes=own))
+            else:
+                modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
+        return self._scaled(modal, point)
 
-    def _scaled(self, modal: ModalPlant) -> ScaledPlant:
+    def _scaled(self, modal: ModalPlant, point: Array, to_point: bool = False) -> ScaledPlant:
+        """Scale a modal plant, with what disturbing forces move where an error of the gain leaves
+        it alone; `to_point`: its derivatives are those to `names`."""
         if self.own is not None:
-            return scale_at_ports(modal, self.M_K, self.own)
-        return scale_plant(modal, self.M_K, bare=True)
+            found = scale_at_ports(modal, self.M_K, self.own)
+        else:
+            found = scale_plant(modal, self.M_K, bare=True)
+        if not self._forces_at_u(modal.B.shape[1]):
+            return found
+        row = self.names.index("gain")
+        return with_forces_of_model(found, 1.0 + float(point[row]), row if to_point else None)
+
+    @property
+    def _of_u(self) -> int | None:
+        """How many inputs are those of u; None: all."""
+        return self.inputs if self.own is None else self.own.inputs
+
+    def _forces_at_u(self, inputs: int) -> bool:
+        """Whether disturbing forces act where u does, on plants whose gain errs."""
+        return bool(self.gain) and inputs == (self._of_u or inputs)
 
     def with_slopes(self, point: Array, option: int = 0) -> ScaledPlant:
         """The same with derivatives to the point itself, one for each of `names`.
@@ -163,7 +185,8 @@ class UncertainPlant:
         """
         modal, values = self._modal(point, option), np.asarray(point, float)
         if modal.states is not None:
-            return self._scaled(replace(modal, states=self._to_point(modal.states, values)))
+            states = self._to_point(modal.states, values)
+            return self._scaled(replace(modal, states=states), values, True)
         flexible = np.flatnonzero(~modal.rigid)
         count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
         dM, dK, dD = np.zeros((3, count, n, n))
@@ -175,7 +198,7 @@ class UncertainPlant:
         for row, (name, value) in enumerate(zip(self.names[:first], values.tolist(), strict=False)):
             word, _, number = name.partition(" ")
             if word == "gain":
-                dB[row] = modal.B / (1.0 + value)
+                dB[row][:, : self._of_u] = modal.B[:, : self._of_u] / (1.0 + value)
                 continue
             if word == "damping":
                 own = np.ix_(flexible, flexible)
@@ -186,13 +209,14 @@ class UncertainPlant:
             if not given:
                 dD[row, at, at] = modal.D[at, at] / (1.0 + value)
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
-        return self._scaled(moved)
+        return self._scaled(moved, values, True)
 
     def _to_point(self, states: FirstOrderPlant, values: Array) -> FirstOrderPlant:
         """A plant of first order with derivatives to the point; see `sloped`."""
         system, first = states.system, len(self.names) - len(self.ranges)
+        of_u = np.arange(system.B.shape[1]) < (self._of_u or system.B.shape[1])
         rows = [
-            (0.0 * system.A, system.B / (1.0 + value)) if name == "gain"
+            (0.0 * system.A, system.B * of_u / (1.0 + value)) if name == "gain"
             else states.to_point(name, value)
             for name, value in zip(self.names[:first], values.tolist(), strict=False)
         ]  # fmt: skip
@@ -222,7 +246,7 @@ class UncertainPlant:
         modal = modal_plant(system, self._free, off)
         modal = without_hidden_rigid_modes(modal)
         gain = 1.0 + values.get("gain", 0.0)
-        return modal if gain == 1.0 else modal.scale_input(gain)
+        return modal if gain == 1.0 else modal.scale_input(gain, self._of_u)
 
     def plants(self, points: Sequence[tuple[int, Array]]) -> list[ScaledPlant]:
         """The plants of (option, point) pairs."""
@@ -233,11 +257,18 @@ class UncertainPlant:
         found = []
         for option, point in points:
             values, system, off = self._off(point, option)
+            gain = values.get("gain", 0.0)
             plant = as_written(
-                system, shift=off.shift, modes=off.modes, damping=off.damping,
-                gain=values.get("gain", 0.0), rigid_modes=self.rigid_modes,
+                system, shift=off.shift, modes=off.modes, damping=off.damping, gain=gain,
+                inputs=self._of_u, rigid_modes=self.rigid_modes,
             )  # fmt: skip
-            found.append(plant if self.own is None else self.own.apart(plant))
+            plant = plant if self.own is None else self.own.apart(plant)
+            if self._forces_at_u(system.B.shape[1]):
+                body = plant.mechanics if isinstance(plant, ForcedPlant) else plant
+                body = strictly_proper(body.A, body.B / (1.0 + gain), body.C)
+                counted = plant.counted if isinstance(plant, ForcedPlant) else None
+                plant = ForcedPlant.of(plant, body, counted)
+            found.append(plant)
         return found
 
     def drawn(self, rng: np.random.Generator, count: int) -> list[tuple[int, Array]]:
@@ -280,6 +311,32 @@ class UncertainPlant:
                 points = [at.get(name, 0) for name in goes_with]
                 found.append((option, box[points, np.arange(len(centre))]))
         return found
+
+
+def with_forces_of_model(
+    plant: ScaledPlant, strength: float, row: int | None = None
+) -> ScaledPlant:
+    """Add what disturbing forces at u move to a plant that u moves otherwise than on the model.
+
+    Parameters
+    ----------
+    plant : ScaledPlant
+        With all of B times a factor.
+    strength : float
+        The factor.
+    row : int, optional
+        Which of its derivatives is that to the factor; forces have none to it.
+
+    Returns
+    -------
+    ScaledPlant
+        Its `mechanics` are those of the model.
+    """
+    body = plant.mechanics or plant
+    dB = body.dB / strength
+    if row is not None:
+        dB[row] = 0.0
+    return replace(plant, mechanics=replace(body, B=body.B / strength, dB=dB))
 
 
 @dataclass(frozen=True)
@@ -328,7 +385,11 @@ class ModalSum:
         return "" if self.rigid[i] else f"mode_shift {int((~self.rigid[: i + 1]).sum())}"
 
     def strength(self, names: tuple[str, ...], low: Array, high: Array) -> Affine:
-        """1 + p_gain over boxes (n_p, N) of `names`, with the variables of `poles`."""
+        """1 + p_gain over boxes (n_p, N) of `names`, with the variables of `poles`.
+
+        It is of b_i, and of f_i too where u and a force move the modes alike: what a force moves
+        is then enclosed as that many times as large.
+        """
         n, m = len(low) + 1, low.shape[1]
         one = Affine(np.ones(m), np.zeros((n, m)), np.zeros(m))
         if "gain" not in names:

@@ -19,6 +19,7 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -170,7 +171,8 @@ def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace)
     found = Loop(plant, controller, problem.sampling, kind_of(problem).bounds().places)
     p, m = controller.B.shape[1], len(controller.C)
     if plant.D.shape == (p, m):
-        return found
+        body = plant.mechanics if isinstance(plant, ForcedPlant) else plant
+        return found if np.array_equal(body.B, plant.B) else replace(found, drive=body.B)
     own, counted, force = plant.C[:p], plant.C[p:], None
     if problem.source.wiring.actuator:
         counted, force = counted[:-m], counted[-m:]

@@ -302,12 +302,13 @@ def uncertain_plant(
     """
     u, held = structured_of(problem).uncertainty, problem.source.held
     own = Ranged(problem, tuple(map(float, theta)))
+    narrow = replace(problem, source=replace(problem.source, wide=False))
     return UncertainPlant(
         tuple(known) or tuple(mechanics(plant_of(option), theta) for option in _options(problem)),
         problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges),
         own.along, own.graph,
-        problem.suspension.rigid_modes, bounded_ports(problem)[1],
+        problem.suspension.rigid_modes, bounded_ports(problem)[1], plant_of(narrow).inputs,
     )  # fmt: skip
 
 

@@ -145,17 +145,6 @@ class StructuredProblem(ControllerProblem):
     bandwidth_of: str | None = None
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        gain = self.uncertainty.gain
-        if self.compliance_max is None or not gain:
-            return ()
-        return (
-            "[robust] gain scales the whole plant, what a force moves with it: if only the gain of "
-            f"actuators or sensors errs, a force moves up to {1.0 / (1.0 - gain):.4g} times as "
-            "much as is stated",
-        )
-
-    @property
     def figure(self) -> FigureOfMerit:
         """The least RMS error or move time where that is minimised, else ω_b*."""
         return FIGURES[self.minimise]

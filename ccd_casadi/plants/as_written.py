@@ -9,10 +9,10 @@ poles and hides free bodies. There x = (η, η̇), q = Φ η with `natural_modes
 modes, M = 1 and K = Λ.
 
 Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d of
-the damping and a gain g,
+the damping and a gain g of what u moves,
 
     K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
-    D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
+    D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   b_j' = (1 + g) b_j.
 
 A plant of first order is as its function returned it, and off its model as `first_order` has it.
 A motion that K drives away, λ_i < 0, has ω_i = 0 here: ζ damps none.
@@ -37,6 +37,7 @@ def as_written(
     modes: Sequence[float] = (),
     damping: float = 1.0,
     gain: float = 0.0,
+    inputs: int | None = None,
     rigid_modes: int | None = None,
     stiff: float = 1e7,
 ) -> StateSpace:
@@ -48,6 +49,8 @@ def as_written(
         M, D, K, B, C at one θ, SI, and the damping ratio ζ where the model gives one.
     shift, modes, damping, gain : float, sequence of float, float, float
         s, s_i in the order of the modes' numbers, d and g; of a given D the matrix is kept.
+    inputs : int, optional
+        How many columns b_j of B are those of u, the first; None: all.
     rigid_modes : int, optional
         How many there are, where the case states it.
     stiff : float
@@ -64,8 +67,10 @@ def as_written(
     PlantError
         Where it is not known which modes are rigid, or no controller can hold one.
     """
+    B = system.B.copy()
+    B[:, :inputs] *= 1.0 + gain
     if system.first_order:
-        system_of = strictly_proper(-system.K, (1.0 + gain) * system.B, system.C)
+        system_of = strictly_proper(-system.K, B, system.C)
         if shift or damping != 1.0 or any(modes):
             none = Slopes(*(np.zeros((0, *part.shape)) for part in (system.K, system.B, system.C)))
             states = first_order(system_of.A, system_of.B, system_of.C, none)
@@ -81,7 +86,7 @@ def as_written(
     zeta = system.damping_ratio or 0.0
     omega = ratio * np.sqrt(np.maximum(lam, 0.0))
     D = damping * (system.D + (pushes * (2.0 * zeta * omega)) @ pushes.T)
-    M, B, C = system.M, (1.0 + gain) * system.B, system.C
+    M, C = system.M, system.C
     sides, soft = _seen(shapes, rigid, B, C), np.abs(lam[~rigid])
     spread = bool(len(soft)) and soft.max() > stiff * soft.min()
     if sides is None and spread:

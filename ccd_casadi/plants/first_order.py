@@ -159,11 +159,11 @@ class FirstOrderPlant:
         """Whether two poles (r, r) are one."""
         return np.abs(self.rates - self.rates[:, None]) <= 1e-9 * np.abs(self.rates)
 
-    def scale_input(self, gain: float) -> "FirstOrderPlant":
-        """Multiply B by a factor."""
-        slopes = self.slopes._replace(dB=gain * self.slopes.dB)
-        leading = self.leading[0], gain * self.leading[1]
-        system = replace(self.system, B=gain * self.system.B)
+    def scale_input(self, gain: Array) -> "FirstOrderPlant":
+        """Multiply every column of B by its factor (m,)."""
+        slopes = self.slopes._replace(dB=self.slopes.dB * gain)
+        leading = self.leading[0], self.leading[1] * gain
+        system = replace(self.system, B=self.system.B * gain)
         return replace(self, system=system, slopes=slopes, leading=leading)
 
     def off(

@@ -153,10 +153,12 @@ class ModalPlant:
             return self.states.modes().resonances
         return number_modes(self.modes, self.rigid)
 
-    def scale_input(self, gain: float) -> "ModalPlant":
-        """Multiply B by a factor."""
-        states = self.states and self.states.scale_input(gain)
-        return replace(self, B=gain * self.B, dB=gain * self.dB, states=states)
+    def scale_input(self, gain: float, inputs: int | None = None) -> "ModalPlant":
+        """Multiply the first `inputs` columns of B by a factor; None: all."""
+        each = np.ones(self.B.shape[1])
+        each[:inputs] = gain
+        states = self.states and self.states.scale_input(each)
+        return replace(self, B=self.B * each, dB=self.dB * each, states=states)
 
     @property
     def state_space(self) -> StateSpace:

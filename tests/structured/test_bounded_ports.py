@@ -76,7 +76,9 @@ def box_of(forces: int, errors: int, wired: int, t: float = 0.0, **box: float) -
     return UncertainPlant((system(t, forces, errors, wired),), 1e6, own=own, **box)  # type: ignore[arg-type]
 
 
-def first_order(forces: int, errors: int, wired: int, shift: float = 0.0) -> tuple[np.ndarray, ...]:
+def first_order(
+    forces: int, errors: int, wired: int, shift: float = 0.0, gain: float = 0.0
+) -> tuple[np.ndarray, ...]:
     """A, B of u and of forces, C of the sensor and of what counts."""
     M, K, B, C, E, F = matrices(0.0, forces, errors)
     K = K * (1.0 + shift) ** 2
@@ -100,7 +102,7 @@ def first_order(forces: int, errors: int, wired: int, shift: float = 0.0) -> tup
         y[0, 6] = 1.0
     else:
         y[:, :2] = C
-    return A, Bu, Bd, y, z
+    return A, (1.0 + gain) * Bu, Bd, y, z
 
 
 def moved(
@@ -302,6 +304,43 @@ def test_boxes_enclose_what_forces_move(ports: Key, integrator: bool, run: Sampl
             assert found.lowest[k, 0] * (1.0 - 1e-6) <= value <= found.highest[k, 0] * (1.0 + 1e-6)
         seen += bool(found.highest[k, 0] < 1.5 * value)
     assert seen > 20  # so that they are not infinite
+
+
+AT_U = (0, 0, BARE)
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("ports", [AT_U, (1, 0, BARE), (0, 1, BARE), (2, 1, AMPLIFIER)])
+def test_an_error_of_the_gain_moves_what_u_moves_alone(ports: Key, run: Sampling | None) -> None:
+    """A motor 10 % weak: the same force meets a softer loop. Of what u moves alone the peak grows,
+    and is proven as closely as without an error; rows have slopes to it."""
+    kappa, K = a_controller(), STRUCTURE.state_space(a_controller())
+    box = box_of(*ports, gain=0.1)
+    if ports == AT_U:
+        box = replace(box, own=None)
+    gains = np.linspace(-0.1, 0.1, 9)
+    own = np.array([peak_of(first_order(*ports, gain=g), K, run) for g in gains])
+    judged = certify(box.as_written([(0, np.array([g])) for g in gains]), K, BOUNDS, run)
+    np.testing.assert_allclose([one.GS for one in judged.plants], own, rtol=1e-6)
+    assert own.argmax() == 0
+
+    def row(g: float) -> tuple[float, float]:
+        plant = box.with_slopes(np.array([g]))
+        problem = problem_for([plant], STRUCTURE, BOUNDS, run)
+        P = problem.plants
+        inside = STRUCTURE.in_units(kappa, 1.0 / P.omega_0, 1.0 / P.force)
+        v = P.variable(np.array([HZ * 60.0 / P.omega_0]))
+        place = RowPlaces(np.array([LoopCurve.GS]), np.zeros(1, int), v)
+        found = constraints(problem, inside, 0.0, place)
+        return float(found.value[0]), float(to_theta(problem, inside, found)[0, 0])
+
+    for g in (-0.1, 0.05):
+        assert row(g)[1] == pytest.approx((row(g + 1e-5)[0] - row(g - 1e-5)[0]) / 2e-5, abs=1e-6)
+    of = (STRUCTURE, kappa, HZ * 5.0)
+    loose = replace(BOUNDS, S_max=20.0, S_low=5.0, shape=None)
+    for share, outcome in ((1.005, ProofOutcome.PROVEN), (0.99, ProofOutcome.REFUTED)):
+        bounds = replace(loose, compliance_max=share * float(own.max()))
+        assert prove(box, *of, bounds, run).outcome is outcome
 
 
 @pytest.mark.parametrize("run", RUNS)

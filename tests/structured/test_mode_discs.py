@@ -20,6 +20,7 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 
@@ -158,7 +159,8 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
             G, own = free, K
             if sampling is not None:
                 G, own = zoh(free, sampling.period, sampling.delay), tustin(K, sampling.period)
-            table = LoopResponses([free], [G], own, sampling, bounds)
+            assert isinstance(free, ForcedPlant)
+            table = LoopResponses([free.mechanics], [G], own, sampling, bounds)
             table = table.at(np.array([0]), at[None, :1])
             for name, (figure, limit) in limits.items():
                 k, value = found.names.index(name), table[figure][0, 0] / limit

@@ -211,7 +211,7 @@ def test_enclosures_hold_what_plants_of_their_boxes_have(
         of_KS, of_T = np.abs(weights.responses(np.array([w])))[1:, 0]
         true = {f"S_MAX of {name}": value / 2.0 for name, value in S.items()}
         true |= {
-            "S_MAX": S["load"] / 2.0, "GS": S["actuator"] * abs(free_G[1, 0]),
+            "S_MAX": S["load"] / 2.0, "GS": S["actuator"] * abs(free_G[1, 0]) / (1.0 + at[3]),
             "SHAPE": S["load"] / (limits.room(counted / 0.3) * np.sqrt(0.5) * counted / 0.3),
             "KS": of_KS * S["actuator"] * np.linalg.norm(K @ U.T),
             "T": of_T * S["actuator"] * abs(K[0, 1] * G[1, 0]),

@@ -73,7 +73,8 @@ def test_discs_hold_the_plant_behind_its_wiring(ground: float, run: Sampling | N
             omega = at[0, k] * (UNIT if run is None else 1.0 / run.period)
             (G,) = uncertain.as_written([(0, at[1:, k])])
             exact = plain(G, omega) if run is None else held(G, run, omega)
-            for discs, value in ((loop, exact), (free, plain(G.mechanics, omega))):
+            moved = (1.0 + at[2, k]) * plain(G.mechanics, omega)  # of a force, that is held as u
+            for discs, value in ((loop, exact), (free, moved)):
                 off = abs(value - discs.middle[:, k] @ scale)
                 radius = discs.radius[:, k] @ np.abs(scale)
                 assert off <= radius * (1.0 + 1e-9) + 1e-9 * abs(value)

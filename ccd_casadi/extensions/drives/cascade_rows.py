@@ -21,6 +21,7 @@ from ccd_casadi.extensions.drives.two_rates import lift
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.lti.wiring import ForcedPlant
 from ccd_casadi.support.arrays import Array
 
 FORCE = "force"  # the place of z/d
@@ -128,7 +129,8 @@ def split(plant: StateSpace, cascade: Cascade) -> tuple[StateSpace, Array, Array
     """Take apart a plant with its ports: from the drive's force to the sensors, where forces act
     (n, q), and what counts (z, n); without ports the drive's force, and the position's sensor."""
     p = cascade.sensors
-    drive = plant.B[:, 1:] if plant.B.shape[1] > 1 else plant.B
+    body = plant.mechanics if isinstance(plant, ForcedPlant) else plant
+    drive = plant.B[:, 1:] if plant.B.shape[1] > 1 else body.B
     counted = plant.C[p:] if len(plant.C) > p else plant.C[[cascade.position]]
     return strictly_proper(plant.A, plant.B[:, :1], plant.C[:p]), drive, counted
 
