@@ -7,8 +7,8 @@ import numpy as np
 
 from ccd_casadi.kernels.certified_design import design, judge
 from ccd_casadi.kernels.certified_design import sweep as _sweep
+from ccd_casadi.kernels.generalized_plant import unstable_part
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.unstable_plant import unstable_part
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

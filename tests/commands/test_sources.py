@@ -20,7 +20,7 @@ LIVE = {
 PROCESSES = {
     ("ccd_casadi/extensions/formats/code_formats.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
+    ("ccd_casadi/extensions/explorer/session.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }

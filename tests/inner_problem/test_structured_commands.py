@@ -26,7 +26,7 @@ from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.extensions.feedforward import main as feedforward_main
-from ccd_casadi.extensions.feedforward.move_responses import Shape, responses_of
+from ccd_casadi.extensions.feedforward.coefficients import Shape, responses_of
 from ccd_casadi.extensions.limitations import main as gap_main
 from ccd_casadi.extensions.limitations.limits import discs
 from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis

@@ -33,9 +33,8 @@ from ccd_casadi.extensions.explorer.designs import (
     present,
 )
 from ccd_casadi.extensions.explorer.knobs import Notch, Problems, case_at, judge_notched, knobs_of
-from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.extensions.explorer.pins import landscape_of, steepest_axes
-from ccd_casadi.extensions.explorer.session import Session
+from ccd_casadi.extensions.explorer.session import KnownPlant, Session, frequency_error
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.places import Places

@@ -45,7 +45,6 @@ from ccd_casadi.extensions.explorer.designs import (
     with_warm_starts_of,
 )
 from ccd_casadi.extensions.explorer.knobs import Knobs
-from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.painter import (
     ON_DARK,
     Message,
@@ -61,7 +60,7 @@ from ccd_casadi.extensions.explorer.pins import (
     run_surrogate,
     steepest_axes,
 )
-from ccd_casadi.extensions.explorer.session import Session, search_exactly
+from ccd_casadi.extensions.explorer.session import Background, Session, Solve, search_exactly
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -16,17 +16,15 @@ from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.robust_set import members
-from ccd_casadi.extensions.feedforward.least_time import (
+from ccd_casadi.extensions.feedforward.coefficients import (
     ForceLimits,
     LeastTime,
     LeastTimeOptions,
-    least_time,
-)
-from ccd_casadi.extensions.feedforward.move_responses import (
     MoveResponses,
     Shape,
     contraction,
     learning_gain,
+    least_time,
     responses_of,
 )
 from ccd_casadi.inner_problem.kinds import kind_of

@@ -34,7 +34,11 @@ EXTENSION = Extension(
 
 
 def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
-    from ccd_casadi.extensions.imported.matrices import read_index, reduced_table, results_table
+    from ccd_casadi.extensions.imported.sampled_plant import (
+        read_index,
+        reduced_table,
+        results_table,
+    )
 
     columns = next(iter(read_index(folder).values()))
     if "results" in columns:
@@ -50,7 +54,7 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
     "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
     valued("--modes", "N", integer(1), "modes of matrices", 10),
     option("--static-correction", action="store_true", help="exact static compliance of matrices"),
-    needs=["ccd_casadi.extensions.imported.matrices"],
+    needs=["ccd_casadi.extensions.imported.sampled_plant"],
     place=RUN | {"metavar": "FOLDER", "help": "the folder with index.csv and dofs.csv"},
     without_effect=["--workers", "--seed", "--no-user-code"],
 )  # fmt: skip

@@ -41,8 +41,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
-    from ccd_casadi.extensions.schedule.handover import cross, rates_tried, way_of
-    from ccd_casadi.extensions.schedule.rate_bound import rate_bound_of
+    from ccd_casadi.extensions.schedule.handover import cross, rate_bound_of, rates_tried, way_of
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
         entry,

@@ -14,11 +14,11 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.extensions.schedule.handover import (
     CrossingOptions,
+    RateBound,
     RateTrial,
     controllers_of,
     handovers,
 )
-from ccd_casadi.extensions.schedule.rate_bound import RateBound
 from ccd_casadi.extensions.schedule.segments import (
     Alone,
     DesignedPart,
