@@ -316,7 +316,7 @@ def over_family(
         return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scale(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
-    def assessed(member: ScaledPlant, gamma: float) -> Array:
+    def assess(member: ScaledPlant, gamma: float) -> Array:
         own = row.copy()
         loop = (member.A, member.B, member.C, *controller, Dk)
         judge(*loop, w, weights.delta, gamma, omega_low / w0, own)
@@ -324,7 +324,7 @@ def over_family(
 
     own, worst = row.copy(), plant
     for member in plant.members[1:]:
-        other = assessed(member, CertificateOptions().unbounded)
+        other = assess(member, CertificateOptions().unbounded)
         if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
             figures = figures_from_row(own, weights, w0)
             return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member

@@ -30,7 +30,7 @@ from ccd_casadi.extensions.explorer.curves import (
     STYLES,
     Drawn,
     curves_of,
-    drawn,
+    draw_design,
     machine_html,
     move_words,
     sampled_of,
@@ -237,7 +237,7 @@ class ExplorerPage:
         design, curves, sampled = self._shown
         session, view = self.session, None if curves is None else curves.view
         notched = None if view is None else self.notch.of(view)
-        self.now = now = drawn(design, curves, sampled, notched)
+        self.now = now = draw_design(design, curves, sampled, notched)
         self._serial += 1
         answer = {
             "serial": [self._serial],

@@ -25,7 +25,7 @@ from ccd_casadi.extensions.explorer.designs import (
     ExploredDesign,
     How,
     elements_at,
-    judged_design,
+    judge_design,
     present,
     search_inner,
     with_warm_starts_of,
@@ -283,17 +283,17 @@ class Session:
         """
         problem = self.problems.at(knobs)
         if kind_of(problem).as_designed:
-            return self._held(problem, knobs)
+            return self._judge_held(problem, knobs)
         elements = self.elements(problem, knobs.theta)
         return present(problem, knobs, elements, (self.point[0], self.point[1]))
 
-    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> ExploredDesign:
+    def _judge_held(self, problem: CoDesignProblem, knobs: Knobs) -> ExploredDesign:
         problem = with_warm_starts_of(problem, self.designed_for)
         if self.kappa is None:
             elements = elements_at(problem, knobs.theta)
             words = "no controller yet: design one here"
             return without_controller(problem, knobs, elements, How.STRUCTURED, words)
-        return judged_design(problem, knobs, self.kappa, How.HELD)
+        return judge_design(problem, knobs, self.kappa, How.HELD)
 
     def took_designed(self, found: Designed) -> ExploredDesign | None:
         """A design of a fixed structure ended: into the store, and the controller of looks to come.
@@ -306,7 +306,7 @@ class Session:
         if found.kappa is None:
             return None
         self.kappa, self.designed_for = found.kappa, found.problem
-        return judged_design(found.problem, found.knobs, found.kappa, How.STRUCTURED)
+        return judge_design(found.problem, found.knobs, found.kappa, How.STRUCTURED)
 
     def full(self, knobs: Knobs) -> ExploredDesign:
         """The inner problem at θ on the model itself."""

@@ -120,7 +120,7 @@ def set_feedforward(
         responses, _shapes(run, one, taps, samples, options), x, window, limits, latest, options
     )
     for i in range(options.rounds):
-        more = respond(_drawn(run, options.drawn, [seed, 1 + i]), samples=samples)
+        more = respond(_draw_plants(run, options.drawn, [seed, 1 + i]), samples=samples)
         times = np.array(
             [one.with_taps(found.shape).settling_time(found.x, window) for one in more]
         )
@@ -130,7 +130,7 @@ def set_feedforward(
             break
         responses += [more[i] for i in worst]
         found = _best(responses, [found.shape], x, window, limits, length, options)
-    judges = respond(_drawn(run, options.judges, [seed, 0]), samples=samples)
+    judges = respond(_draw_plants(run, options.judges, [seed, 0]), samples=samples)
 
     def times_of(some: Sequence[MoveResponses], shape: Shape, x: Array) -> Array:
         return np.array([each.with_taps(shape).settling_time(x, window) for each in some])
@@ -173,10 +173,10 @@ def _responses(
             for plant in plants]  # fmt: skip
 
 
-def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+def _draw_plants(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     """Plants from the box of a run; none where it has none."""
     if not kind_of(run.problem).as_designed:
-        return _drawn_shifts(run, count, seed)
+        return _draw_shifted(run, count, seed)
     uncertain = uncertain_plant(run.problem, run.theta)
     if not uncertain.names and len(uncertain.options) == 1:
         return []
@@ -184,7 +184,7 @@ def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     return [plant.plant_si() for plant in uncertain.plants(points)]
 
 
-def _drawn_shifts(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+def _draw_shifted(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     """Plants from the ranges of resonances and damping of a full-order run."""
     robust, rng = run.problem.robust, np.random.default_rng(seed)
     if robust is None:

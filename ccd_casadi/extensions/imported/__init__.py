@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, option, valued
+from ccd_casadi.support.options import integer, option, take_value
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
 @command(
     "ccd_casadi.imported",
     "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
-    valued("--modes", "N", integer(1), "modes of matrices", 10),
+    take_value("--modes", "N", integer(1), "modes of matrices", 10),
     option("--static-correction", action="store_true", help="exact static compliance of matrices"),
     needs=["ccd_casadi.extensions.imported.sampled_plant"],
     place=RUN | {"metavar": "FOLDER", "help": "the folder with index.csv and dofs.csv"},
