@@ -12,7 +12,6 @@ from oracles.sources import ROOT, SOURCES, nodes
 # Pipes between the processes of one run.
 LIVE = {
     "ccd_casadi/support/process_pool.py", "ccd_casadi/support/worker_process.py",
-    "ccd_casadi/support/lent_pool.py",
     "ccd_casadi/extensions/cluster/dask_pool.py",
 }  # fmt: skip
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
