@@ -55,7 +55,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.kernels.sensitivity": ("HALF_POWER",),
     "ccd_casadi.extensions.cad.elastic_body": ("AXES", "OUTWARD"),
     "ccd_casadi.extensions.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
-    "ccd_casadi.plants.rigid_modes": ("EPS",),
+    "ccd_casadi.plants.as_written": ("EPS",),
     "ccd_casadi.plants.table_columns": ("COMPLIANCE", "RATES", "RATE_NAMES"),
     "ccd_casadi.extensions.measured.measured_answer": ("HEIGHT",),
     "ccd_casadi.extensions.records.record_findings": ("WIDTH", "LEFT", "RIGHT", "ROWS"),
