@@ -190,7 +190,7 @@ class _Branching:
     def _note(self, lists: Lists, found: Solution, own: CoDesignProblem) -> Solution:
         """Note the node of a solution; a solution without its problem is of `own`."""
         result = found.result
-        words, J = _made_of(self.problem, result), result.get("objective", np.inf)
+        words, J = _describe_terms(self.problem, result), result.get("objective", np.inf)
         self.nodes[tuple(lists.values())] = Node(lists, result["status"], J, words)
         return replace(found, problem=found.problem or own)
 
@@ -282,7 +282,7 @@ def best_of_lists(
     if best is None:  # the time was up
         with stage(StageOptions.ending):
             best = way.end_early()
-    listed = _listed(problem, best, [*way.nodes.values()], way.left, way.judged)
+    listed = _describe_lists(problem, best, [*way.nodes.values()], way.left, way.judged)
     result = with_all_spent(best.result, sampler.spent.by_purpose) | {
         "seconds": perf_counter() - began, "listed": listed | {"exchanged": way.tried},
     }  # fmt: skip
@@ -350,7 +350,7 @@ def _halves(lists: Lists) -> list[Lists]:
     return [lists | {name: values[middle:]}, lists | {name: values[:middle]}]
 
 
-def _listed(
+def _describe_lists(
     problem: CoDesignProblem, best: Solution, nodes: list[Node], left: list[_Part], judged: int
 ) -> dict[str, Any]:
     whole = sum(node.whole for node in nodes)
@@ -375,7 +375,7 @@ def _listed(
     })  # fmt: skip
 
 
-def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+def _describe_terms(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     """Describe the terms of J: the bandwidth or the error, at the hardware cost."""
     if "hardware_cost" not in result:
         return ""
@@ -395,7 +395,7 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     above, free = found["objective_above_free"], ""
     if above is not None:
         far = f"{above:.3g} above" if above > 0.0 else "no worse than"
-        there, here = found["nodes"][0]["words"], _made_of(problem, result)
+        there, here = found["nodes"][0]["words"], _describe_terms(problem, result)
         figures = f" ({there} there, {here} here)" if there else ""
         free = f"; J is {far} the best with any value between them{figures}"
     counts = f"{found['solved']} of {plural(found['combinations'], 'combination')} searched"

@@ -317,10 +317,10 @@ def results(
         The workers of a task died twice.
     """
     calls = [(key, function, arguments) for key, arguments in tasks.items()]
-    return (workers or Workers(1)).map_unordered(_keyed, calls)
+    return (workers or Workers(1)).map_unordered(_run_keyed, calls)
 
 
-def _keyed(task: tuple[K, Callable[..., R], tuple[Any, ...]]) -> tuple[K, R]:
+def _run_keyed(task: tuple[K, Callable[..., R], tuple[Any, ...]]) -> tuple[K, R]:
     key, function, arguments = task
     return key, function(*arguments)
 
