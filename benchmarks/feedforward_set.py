@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.extensions.feedforward.move_responses import (
+from ccd_casadi.extensions.feedforward.coefficients import (
     learn,
     learning_gain,
     least_error,

@@ -17,7 +17,7 @@ from time import perf_counter
 from threadpoolctl import threadpool_limits
 
 import ccd_casadi as ccd
-from ccd_casadi.codesign.lifted import solve_lifted
+from ccd_casadi.codesign.formulations import solve_lifted
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers

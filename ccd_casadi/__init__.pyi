@@ -5,7 +5,7 @@ from ccd_casadi.cases.case import parse_case as parse_case
 from ccd_casadi.cases.case_problem import problem_of as problem_of
 from ccd_casadi.cases.run_folder import read_run as read_run
 from ccd_casadi.codesign.formulations import Direct as Direct
-from ccd_casadi.codesign.lifted import Lifted as Lifted
+from ccd_casadi.codesign.formulations import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
 from ccd_casadi.codesign.run import solve as solve
 from ccd_casadi.codesign.run import verify as verify

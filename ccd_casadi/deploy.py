@@ -11,7 +11,7 @@ from ccd_casadi.robust import MOVE_OPTIONS, move_of
 from ccd_casadi.support import extensions
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line, option, positive, real, valued
+from ccd_casadi.support.options import one_line, option, positive, real, take_value
 from ccd_casadi.support.terminal import Progress, inform, say
 from ccd_casadi.support.text import spoken, with_unit
 
@@ -55,9 +55,9 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
     option("--fmu", action="store_true",
            help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
            "names"),
-    valued("--sensor-step", "METRE", real(), "of the simulated sensor", 0.0),
-    valued("--force-step", "NEWTON", real(), "of the simulated actuator", 0.0),
-    valued("--jitter", "SECONDS", real(),
+    take_value("--sensor-step", "METRE", real(), "of the simulated sensor", 0.0),
+    take_value("--force-step", "NEWTON", real(), "of the simulated actuator", 0.0),
+    take_value("--jitter", "SECONDS", real(),
            "of the simulated delay, uniform within plus or minus this", 0.0),
     *MOVE_OPTIONS, needs=["ccd_casadi.deployment.pipeline"], place=RUN,
 )  # fmt: skip
@@ -81,7 +81,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"
         raise UserError(f"--out {folder}: {words}; choose another folder")
-    found, moved = _deployed(run, options)
+    found, moved = _deploy(run, options)
     _remove_earlier(folder)
     write_files(folder, run, found, options.seed, moved)
     if moved is not None:
@@ -119,7 +119,7 @@ def _require_one_precision(options: argparse.Namespace) -> None:
         raise UserError("--fmu: is of double precision; drop it, or --single, --fixed")
 
 
-def _deployed(
+def _deploy(
     run: "FinishedRun", options: argparse.Namespace
 ) -> tuple["Deployment", "OnHardware | None"]:
     """Deploy a run's controller, and simulate its move where the loop is stable."""

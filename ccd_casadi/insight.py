@@ -8,14 +8,14 @@ case gives, what limits the bandwidth, and the rule of thumb against what was ac
 import argparse
 
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command, run_folder
-from ccd_casadi.support.options import integer, valued
+from ccd_casadi.support.options import integer, take_value
 from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import inform
 
 
 @command(
     "ccd_casadi.insight", "Trade hardware cost against bandwidth.",
-    valued("--points", "N", integer(2, 9999), "most points on the front", 20),
+    take_value("--points", "N", integer(2, 9999), "most points on the front", 20),
     SCHEDULER, needs=["ccd_casadi.codesign.pareto"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import integer, option, real, valued
+from ccd_casadi.support.options import integer, option, real, take_value
 from ccd_casadi.support.process_pool import PoolOptions, pool
 from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 @command(
     "surrogates.retrain", "True samples where they help the optimum most, then a new fit.",
-    valued("--budget", "N", integer(1), "most syntheses that retraining adds in total", 500),
+    take_value("--budget", "N", integer(1), "most syntheses that retraining adds in total", 500),
     option("--tolerance", metavar="X", type=real(1e-12, 0.5),
            help="relative agreement of prediction and truth (default: the case's)"),
     SCHEDULER, needs=["ccd_casadi.codesign.run"],

@@ -6,7 +6,7 @@ from pathlib import Path
 from ccd_casadi.robust import MOVE_OPTIONS, Demands, move_of
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import integer, option, positive, real, valued
+from ccd_casadi.support.options import integer, option, positive, real, take_value
 from ccd_casadi.support.process_pool import PoolOptions, Workers
 from ccd_casadi.support.terminal import inform, plain
 
@@ -19,14 +19,15 @@ PERCENT = real(0.0, 50.0, strict=True)
     option("--controller", type=Path, metavar="FILE",
            help="judge this controller, not the run's: .json, .mat or .toml, see "
            "docs/robustness.md"),
-    valued("--shift", "PERCENT", PERCENT, "resonance shift", 5.0),
+    take_value("--shift", "PERCENT", PERCENT, "resonance shift", 5.0),
     option("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
            help="range of factors of the damping (default: 0.5 2)"),
-    valued("--tolerance", "PERCENT", PERCENT, "tolerance of every hardware parameter", 1.0),
-    valued("--samples", "N", integer(1), "number of random sets of hardware", 200),
-    valued("--noise", "X", positive, "sensor noise, m/√Hz", 1.0),
-    valued("--disturbance", "X", positive, "density of the force at every actuator, N/√Hz", 1.0),
-    valued("--axis", "N", integer(1), "output that moves", 1),
+    take_value("--tolerance", "PERCENT", PERCENT, "tolerance of every hardware parameter", 1.0),
+    take_value("--samples", "N", integer(1), "number of random sets of hardware", 200),
+    take_value("--noise", "X", positive, "sensor noise, m/√Hz", 1.0),
+    take_value("--disturbance", "X", positive, "density of the force at every actuator, N/√Hz",
+               1.0),
+    take_value("--axis", "N", integer(1), "output that moves", 1),
     *MOVE_OPTIONS, needs=["ccd_casadi.robust.study"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

@@ -128,7 +128,7 @@ class LoopView:
         """The least and the largest frequency, Hz."""
         return float(self.hz[0]), float(self.hz[-1])
 
-    def named(self, name: str) -> str:
+    def name_gain(self, name: str) -> str:
         """`|S|`, or of several channels the largest singular value."""
         return f"|{name}|" if self.scalar else f"σ_max({name})"
 

@@ -150,7 +150,7 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
         if not motion.required:
             words = "is missing: a spring or a magnet holds the output, whose force the motor needs"
             raise UserError(f"move.acceleration: {words} besides; give it")
-        return _held(motion, forces, mass, holding)
+        return _compute_held(motion, forces, mass, holding)
     allowed, motor = motion.limits, motion.motor
     acceleration, why = allowed.acceleration, "acceleration"
     if motor is not None and not motion.required:
@@ -168,7 +168,7 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
     return replace(found, limits=limits)
 
 
-def _held(
+def _compute_held(
     motion: Motion, forces: Array, mass: Any, holding: Array,
     options: MotionOptions = MotionOptions(),
 ) -> Cycle:  # fmt: skip

@@ -153,7 +153,7 @@ class Responses:
     beyond: tuple[np.ndarray, np.ndarray] | None = None
     given: np.ndarray | None = None
 
-    def seen(self, kind: SourceKind) -> np.ndarray:
+    def respond_to(self, kind: SourceKind) -> np.ndarray:
         """Compute the response of the controller's input to a source."""
         if kind in FORCES:
             return -self.moved
@@ -161,7 +161,7 @@ class Responses:
 
     def of(self, kind: SourceKind) -> tuple[np.ndarray, np.ndarray]:
         """H_e, and H_u of the force that the machine gets, of a source."""
-        seen = self.seen(kind)
+        seen = self.respond_to(kind)
         force = self.K @ seen
         true = np.eye(seen.shape[1]) + seen if kind is SourceKind.SENSOR_NOISE else seen
         true = self.ports.wanted @ self.ports.rows @ true

@@ -228,7 +228,7 @@ class Lyapunov:
     def __init__(self, A: Array, *, sampled: bool) -> None:
         self.inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A) if sampled else None
         continuous = A if self.inverse is None else self.inverse @ A
-        self.T, _, real, _, self.U, *_ = dgees(_unsorted, continuous)
+        self.T, _, real, _, self.U, *_ = dgees(_select_none, continuous)
         self.stable = bool(real.max(initial=-np.inf) < 0.0)
 
     def covariance(self, Q: Array) -> Array:
@@ -247,7 +247,7 @@ class Lyapunov:
         return np.asarray(0.5 * (P + P.T))
 
 
-def _unsorted(real: float, imaginary: float) -> bool:
+def _select_none(real: float, imaginary: float) -> bool:
     return False
 
 

@@ -138,7 +138,7 @@ def process_of_plant(
     if hold is not None:
         enters = [0.0 * part for part in enters]
         noise = [noise_of_a_period(G.A, drive, T), noise_of_a_period(f.A, f.B, T)]
-        G, f = _held(G, hold), replace(f, A=over(f.A, T)[0])
+        G, f = _hold(G, hold), replace(f, A=over(f.A, T)[0])
     held = len(G.A)
     first = held + order  # of the filters that the controller reads
     count, q, kind = first + len(f.A), drive.shape[1], np.result_type(G.A, G.B, G.C)
@@ -231,7 +231,7 @@ def process(loop: Loop, source: ErrorSource) -> Process:
     return replace(found, F=given, V=0.0 * found.V)
 
 
-def _held(G: StateSpace, hold: Sampling) -> StateSpace:
+def _hold(G: StateSpace, hold: Sampling) -> StateSpace:
     """The plant behind hold and delay, states [x; u_{k-1}; …]; A their change over a period."""
     n, m = G.B.shape
     whole, rest = delay_parts(hold.period, hold.delay)

@@ -23,7 +23,7 @@ from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
 
 
-def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
+def check_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
     """The table with its nodes as numbers, so that a run's own case needs no other file."""
     if table == PlacesTable():
         return table
@@ -114,7 +114,7 @@ TABLE_CHECKS: dict[str, checks.KeyCheck] = {
 }
 
 
-def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
+def check_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
     """The table with every entry checked and the files of spectra read into `psd`."""
     found: dict[str, tuple[Mapping[str, Any], ...]] = {}
     for kind in SourceKind:

@@ -177,8 +177,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     if placed or tables["budget"] != BudgetTable():  # few cases have these
         from ccd_casadi.cases import budget
 
-        tables["budget"] = budget.checked_budget(tables["budget"], path.parent, fail)
-        tables["places"] = budget.checked_places(tables["places"], path.parent, fail)
+        tables["budget"] = budget.check_budget(tables["budget"], path.parent, fail)
+        tables["places"] = budget.check_places(tables["places"], path.parent, fail)
     plant = plant_table(data["plant"], path, fail)
     own = dict(data["plant"])
     plants = tuple(_options_of(one, own, path, fail) for one in tables["robust"].plants)

@@ -31,7 +31,7 @@ from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import one_line
-from ccd_casadi.support.terminal import kept_quiet
+from ccd_casadi.support.terminal import keep_quiet
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.user_code import GivenFunction, raised_words
 from ccd_casadi.support.worker_process import one_blas_thread
@@ -199,7 +199,7 @@ def _require_sound(problem: CoDesignProblem, rigid_modes: int | None, at_a_sampl
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity, Topic
 
-    with kept_quiet(True):
+    with keep_quiet(True):
         found = diagnose(problem, rigid_modes)[1]
     for finding in found:
         of_a_sample = at_a_sample and finding.topic is Topic.BETWEEN

@@ -72,7 +72,7 @@ def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail
         raise fail("move.acceleration", f"{words}; give one of them")
     if not given:
         return
-    lists = {name: _listed(getattr(motor, name)) for name in OF_A_MOTOR}
+    lists = {name: _list_values(getattr(motor, name)) for name in OF_A_MOTOR}
     for name, values in lists.items():
         if len(values) != len(lists["force_constant"]) and (values or name == "resistance"):
             raise fail(f"motor.{name}", "has not as many entries as force_constant; give as many")
@@ -116,8 +116,10 @@ def check_filters(tables: Mapping[str, Any], fail: Fail) -> None:
 
 def filters_of(table: "FiltersTable") -> Filters:
     """[actuator] or [sensor] as filters."""
-    second = _listed(table.second_order_hz)
-    return Filters(_listed(table.lag_hz), second, _listed(table.damping) if second else ())
+    second = _list_values(table.second_order_hz)
+    return Filters(
+        _list_values(table.lag_hz), second, _list_values(table.damping) if second else ()
+    )
 
 
 def motion_problem(
@@ -135,15 +137,15 @@ def motion_problem(
         given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
         move.snap or given["jerk"] / shortest,
     )  # fmt: skip
-    k, current = _listed(motor.force_constant), _listed(motor.peak_current)
+    k, current = _list_values(motor.force_constant), _list_values(motor.peak_current)
     made = None if motor == MotorTable() else Motor(
-        k, _listed(motor.resistance), current or (Motor.unlimited,) * len(k),
-        _listed(motor.moving_mass) or (0.0,), motor.rms_power, motor.size,
+        k, _list_values(motor.resistance), current or (Motor.unlimited,) * len(k),
+        _list_values(motor.moving_mass) or (0.0,), motor.rms_power, motor.size,
     )  # fmt: skip
     return Motion(limits, given["settle_band"], move.dwell, made)
 
 
-def _listed(value: Numbers) -> tuple[float, ...]:
+def _list_values(value: Numbers) -> tuple[float, ...]:
     if value is None:
         return ()
     return tuple(map(float, value)) if isinstance(value, tuple) else (float(value),)

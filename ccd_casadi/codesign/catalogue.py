@@ -18,7 +18,7 @@ Source: Land and Doig, Econometrica 28 (1960).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from time import perf_counter
 from typing import Any
@@ -26,14 +26,12 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.design_plants import order
-from ccd_casadi.codesign.exchange import best_exchange
+from ccd_casadi.codesign.exchange import best_exchange, nearest_combination
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
-from ccd_casadi.inner_problem.objective import constraint_shares
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
 from ccd_casadi.support.text import plural
@@ -52,7 +50,6 @@ class BranchOptions:
     no_better: float = 1e-6  # of the terms of J: a bound that is lower by less is cut
     few: int = 4  # combinations up to which all are searched: bounds would save no search
     foreseen: float = 3600.0  # s: a longer time of searching every combination is not shown
-    undecided: int = 12  # lists of which two values are tried where the time is up
 
 
 @dataclass(frozen=True)
@@ -112,6 +109,153 @@ def restrict(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -
     )
 
 
+@dataclass
+class _Branching:
+    """Branch and bound on the way: parts that are left, nodes that were searched, solutions near
+    which others begin, and the best of those that are judged."""
+
+    sampler: Sampler
+    between: Search
+    at: Search
+    judge: Judge | None
+    options: BranchOptions
+    left: list[_Part] = field(default_factory=list)
+    nodes: dict[tuple[tuple[float, ...], ...], Node] = field(default_factory=dict)
+    known: list[Solution] = field(default_factory=list)
+    best: Solution | None = None
+    exchanged: Lists = field(default_factory=dict)  # the combination that exchanges found
+    tried: int = 0  # by exchanges
+    judged: int = 0
+
+    def __post_init__(self) -> None:
+        problem = self.problem = self.sampler.problem
+        ends = zip(problem.names, problem.lower, problem.upper, strict=True)
+        self.width = {name: high - low for name, low, high in ends}
+        self.left.append(_Part(dict(problem.listed), -np.inf, {}))
+        self.count = self.left[0].count
+
+    def take(self) -> _Part | None:
+        """Take the most promising part; None where what is left is cut, or the time is up."""
+        most = self.count // 2 if self.count > self.options.few else 0
+        while self.left:
+            part = min(self.left, key=lambda p: (p.lost, p.bound, p.count > 1,
+                                                 self._distance(p.lists, p.theta)))  # fmt: skip
+            least = self._least()
+            if part.bound >= least or (part.lost and np.isfinite(least)):
+                return None
+            unknown = sum(p.count for p in self.left if p.found is None)
+            if self.nodes and ends_early("listed combination", unknown):
+                return None
+            self.left.remove(part)
+            if part.lists == self.exchanged and part.found is None:
+                continue  # it was searched before the first part was split
+            if part.count == 1 or sum(not node.whole for node in self.nodes.values()) < most:
+                return part
+            rows = product(*([(v,) for v in values] for values in part.lists.values()))
+            self.left += [replace(part, lists=dict(zip(part.lists, row, strict=True)))
+                          for row in rows]  # fmt: skip
+        return None
+
+    def _least(self) -> float:
+        """J from which a part is cut: a design that is not verified cuts nothing."""
+        if self.best is None or self.best.result["status"] != "verified":
+            return np.inf
+        same = _same(self.problem, self.best, self.options.no_better)
+        return float(self.best.result["objective"] - same)
+
+    def _distance(self, lists: Lists, theta: Mapping[str, float]) -> float:
+        """Return the distance of a point from a part, in shares of the ranges."""
+        ends = [(values[0], theta[name], values[-1], self.width[name])
+                for name, values in lists.items() if name in theta]  # fmt: skip
+        return sum(abs(float(np.clip(v, low, high)) - v) / size for low, v, high, size in ends)
+
+    def search(self, part: _Part) -> tuple[Sampler, Solution]:
+        """Search a part, or judge what was found in it, and add what is left of it."""
+        own, whole = restrict(self.problem, part.lists), part.count == 1
+        near = min(self.known, key=lambda item: self._distance(part.lists, _point(item)),
+                   default=None)  # fmt: skip
+        each = self.sampler.of(own, traced=whole)
+        if self.judge is not None and part.found is not None:
+            found, self.judged = self.judge(each, part.found), self.judged + 1
+        else:
+            found = (self.at if whole else self.between)(each, near)
+        found = self._note(part.lists, found, own)
+        J = found.result.get("objective", np.inf)
+        self._loosen(part, found, J)
+        if np.isfinite(J):
+            self.known.append(found)
+        self._branch(part, found, J)
+        return each, found
+
+    def _note(self, lists: Lists, found: Solution, own: CoDesignProblem) -> Solution:
+        """Note the node of a solution; a solution without its problem is of `own`."""
+        result = found.result
+        words, J = _describe_terms(self.problem, result), result.get("objective", np.inf)
+        self.nodes[tuple(lists.values())] = Node(lists, result["status"], J, words)
+        return replace(found, problem=found.problem or own)
+
+    def _loosen(self, part: _Part, found: Solution, J: float) -> None:
+        """Lower the bounds of all others where this one was wrong, and forget where it is from."""
+        gained = part.bound - J if found.result["status"] != "not_verified" else 0.0
+        same = _same(self.problem, found, self.options.no_better)
+        if gained > same:  # as little as that bound are other ends the least of their parts
+            self.known.clear()
+        if gained > same or (part.found and -gained > same):
+            lower = 2.0 * max(gained, 0.0)
+            self.left = [replace(one, bound=one.bound - lower, found=None) for one in self.left]
+
+    def _branch(self, part: _Part, found: Solution, J: float) -> None:
+        """Add what is left of a part that was searched, or compare its design with the best."""
+        if part.count == 1:
+            if self.judge is not None and part.found is None and np.isfinite(J):
+                self.left.append(replace(part, bound=J, found=found))
+            else:
+                self.best = found if self.best is None else min(self.best, found, key=order)
+        elif np.isfinite(J):
+            theta = _point(found)
+            children = _children(self.width, part.lists, theta, self.options.on_value)
+            self.left += [_Part(child, J, theta) for child in children]
+        else:
+            self.left += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
+
+    def exchange(self, between: Sampler, free: Solution) -> None:
+        """Search the combination that exchanges find from an optimum between the values."""
+        assert free.problem is not None
+        of = between.of(free.problem) if self.judge else between  # with its warm starts
+        theta = dict(zip(self.problem.names, self.problem.start, strict=True)) | _point(free)
+        found, self.tried = best_exchange(
+            of, dict(self.problem.listed), theta, nearest_combination(self.problem, theta)
+        )
+        self.exchanged = {name: (value,) for name, value in found.items()}
+        own = restrict(self.problem, self.exchanged)
+        first = self._note(self.exchanged, self.at(self.sampler.of(own), free), own)
+        J = first.result.get("objective", np.inf)
+        if np.isfinite(J):
+            self.known.append(first)
+        if self.judge is None:
+            self.best = first
+        elif np.isfinite(J):
+            self.left.append(_Part(self.exchanged, J, _point(first), first))
+
+    def end_early(self) -> Solution:
+        """Find the design of one combination: of the best that was found, else the nearest to what
+        was."""
+        part = min((part for part in self.left if part.found), key=lambda p: p.bound, default=None)
+        if part is not None and part.found is not None and self.judge is not None:
+            own = restrict(self.problem, part.lists)
+            return self._note(part.lists, self.judge(self.sampler.of(own), part.found), own)
+        best = min(self.known, key=lambda one: one.result["objective"], default=None)
+        theta = dict(zip(self.problem.names, self.problem.start, strict=True))
+        near = nearest_combination(self.problem, theta if best is None else theta | _point(best))
+        lists: Lists = {name: (value,) for name, value in near.items()}
+        own = restrict(self.problem, lists)
+        solution = self.at(self.sampler.of(own), best)
+        if self.judge is not None and np.isfinite(solution.result.get("objective", np.inf)):
+            started = replace(solution, problem=solution.problem or own)
+            solution = self.judge(self.sampler.of(own), started)
+        return self._note(lists, solution, own)
+
+
 def best_of_lists(
     sampler: Sampler,
     between: Search,
@@ -127,163 +271,26 @@ def best_of_lists(
     first combination is that of `best_exchange`.
     """
     began, problem = perf_counter(), sampler.problem
-    width = {name: high - low for name, low, high in
-             zip(problem.names, problem.lower, problem.upper, strict=True)}  # fmt: skip
-
-    def away(lists: Lists, theta: Mapping[str, float]) -> float:
-        """Return the distance of a point from a part, in shares of the ranges."""
-        ends = [(values[0], theta[name], values[-1], width[name]) for name, values in lists.items()
-                if name in theta]  # fmt: skip
-        return sum(abs(float(np.clip(v, low, high)) - v) / size for low, v, high, size in ends)
-
-    open_ = [_Part(dict(problem.listed), -np.inf, {})]
-    nodes: dict[tuple[tuple[float, ...], ...], Node] = {}
-    known: list[Solution] = []
-    best: Solution | None = None
-    exchanged: Lists = {}
-    judged, tried, count = 0, 0, open_[0].count
-    most = count // 2 if count > options.few else 0
-    while open_:
-        part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
-        least = np.inf  # a design that is not verified cuts nothing
-        if best is not None and best.result["status"] == "verified":
-            least = best.result["objective"] - _same(problem, best, options.no_better)
-        if part.bound >= least or (part.lost and np.isfinite(least)):
-            break
-        left = sum(p.count for p in open_ if p.found is None)
-        if nodes and ends_early("listed combination", left):
-            break
-        open_.remove(part)
-        if part.lists == exchanged and part.found is None:
-            continue  # it was searched before the first part was split
-        if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
-            rows = product(*([(v,) for v in values] for values in part.lists.values()))
-            open_ += [replace(part, lists=dict(zip(part.lists, row, strict=True))) for row in rows]
-            continue
-        own, whole = restrict(problem, part.lists), part.count == 1
-        near = min(known, key=lambda item: away(part.lists, _point(item)), default=None)
-        each = sampler.of(own, traced=whole)
-        if judge is not None and part.found is not None:
-            found, judged = judge(each, part.found), judged + 1
-        else:
-            found = (at if whole else between)(each, near)
-        found = replace(found, problem=found.problem or own)
-        J = found.result.get("objective", np.inf)
-        node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
-        nodes[tuple(part.lists.values())] = node
-        gained = part.bound - J if node.status != "not_verified" else 0.0
-        same = _same(problem, found, options.no_better)
-        if gained > same:  # as little as that bound are other ends the least of their parts
-            known.clear()
-        known += [found] if np.isfinite(J) else []
-        if gained > same or (part.found and -gained > same):
-            lower = 2.0 * max(gained, 0.0)
-            open_ = [replace(other, bound=other.bound - lower, found=None) for other in open_]
-        if whole and judge is not None and part.found is None and np.isfinite(J):
-            open_.append(replace(part, bound=J, found=found))
-        elif whole:
-            best = found if best is None else min(best, found, key=order)
-        elif np.isfinite(J):
-            theta = _point(found)
-            open_ += [
-                _Part(child, J, theta)
-                for child in _children(width, part.lists, theta, options.on_value)
-            ]
-        else:
-            open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
-        if exchanges and len(nodes) == 1 and not whole and np.isfinite(J):
-            of = each.of(found.problem or own) if judge else each  # with its warm starts
-            exchanged, tried = _exchange(problem, of, found, options)
-            own = restrict(problem, exchanged)
-            first = at(sampler.of(own), found)
-            first = replace(first, problem=first.problem or own)
-            J = first.result.get("objective", np.inf)
-            words = _made_of(problem, first.result)
-            node = Node(exchanged, first.result["status"], J, words)
-            nodes[tuple(exchanged.values())] = node
-            known += [first] if np.isfinite(J) else []
-            if judge is None:
-                best = first
-            elif np.isfinite(J):
-                open_.append(_Part(exchanged, J, _point(first), first))
-        remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
+    way = _Branching(sampler, between, at, judge, options)
+    while (part := way.take()) is not None:
+        each, found = way.search(part)
+        first = len(way.nodes) == 1 and part.count > 1
+        if exchanges and first and np.isfinite(found.result.get("objective", np.inf)):
+            way.exchange(each, found)
+        remark(_progress(way.count, list(way.nodes.values()), way.left, began), sampler.quiet)
+    best = way.best
     if best is None:  # the time was up
         with stage(StageOptions.ending):
-            best, lists = _in_the_time_left(sampler, at, judge, open_, known, options)
-        name, J = best.result["status"], best.result.get("objective", np.inf)
-        node = Node(lists, name, J, _made_of(problem, best.result))
-        nodes[tuple(lists.values())] = node
+            best = way.end_early()
+    listed = _describe_lists(problem, best, [*way.nodes.values()], way.left, way.judged)
     result = with_all_spent(best.result, sampler.spent.by_purpose) | {
-        "seconds": perf_counter() - began,
-        "listed": _listed(problem, best, [*nodes.values()], open_, judged) | {"exchanged": tried},
-    }
+        "seconds": perf_counter() - began, "listed": listed | {"exchanged": way.tried},
+    }  # fmt: skip
     words = _words(problem, result)
     notes = [*result.get("notes", ()), words]
     if result["status"] == "infeasible":
         result["reason"] = "; ".join(filter(None, (result["reason"], words)))
     return replace(best, result=result | {"notes": notes})
-
-
-def _exchange(
-    problem: CoDesignProblem, sampler: Sampler, free: Solution, options: BranchOptions
-) -> tuple[Lists, int]:
-    """The combination that exchanges find from an optimum between the values, and how many they
-    evaluated."""
-    theta = dict(zip(problem.names, problem.start, strict=True)) | _point(free)
-    begin = {name: values[0] for name, values in _nearest(problem, theta, options).items()}
-    found, tried = best_exchange(sampler, dict(problem.listed), theta, begin)
-    return {name: (value,) for name, value in found.items()}, tried
-
-
-def _in_the_time_left(
-    sampler: Sampler, at: Search, judge: Judge | None, open_: Sequence[_Part],
-    known: Sequence[Solution], options: BranchOptions,
-) -> tuple[Solution, Lists]:  # fmt: skip
-    """The design of one combination: of the best that was found, else the nearest to what was."""
-    problem = sampler.problem
-    found = min((part for part in open_ if part.found), key=lambda p: p.bound, default=None)
-    if found is not None and found.found is not None and judge is not None:
-        own = restrict(problem, found.lists)
-        solution = judge(sampler.of(own), found.found)
-        return replace(solution, problem=solution.problem or own), found.lists
-    best = min(known, key=lambda one: one.result["objective"], default=None)
-    theta = dict(zip(problem.names, problem.start, strict=True))
-    lists = _nearest(problem, theta if best is None else theta | _point(best), options)
-    own = restrict(problem, lists)
-    solution = at(sampler.of(own), best)
-    if judge is not None and np.isfinite(solution.result.get("objective", np.inf)):
-        solution = judge(sampler.of(own), replace(solution, problem=solution.problem or own))
-    return replace(solution, problem=solution.problem or own), lists
-
-
-def _nearest(problem: CoDesignProblem, theta: Mapping[str, float], options: BranchOptions) -> Lists:
-    """The combination of listed values near a θ that keeps the constraints, with the least change
-    of these too: of places that are to be chosen in part."""
-    near = {name: sorted(values, key=lambda v: abs(v - theta[name]))[:2]
-            for name, values in problem.listed}  # fmt: skip
-
-    def undecided(name: str) -> float:
-        first, *second = (abs(value - theta[name]) for value in near[name])
-        return -second[0] / max(first, 1e-300) if second else -np.inf
-
-    both = set(sorted(near, key=undecided, reverse=True)[: options.undecided])
-    rows = product(*(near[name] if name in both else near[name][:1] for name in near))
-    width = np.subtract(problem.upper, problem.lower)
-
-    def shares(one: Mapping[str, float]) -> Array:
-        return constraint_shares(problem, np.array([one[name] for name in problem.names]))
-
-    here = shares(theta)
-
-    def away(one: Mapping[str, float]) -> tuple[float, float]:
-        there = shares(one)
-        moved = [abs(one[name] - theta[name]) for name in problem.names] / width
-        return float(there.max(initial=0.0)), float(
-            moved.sum() + len(near) * abs(there - here).sum()
-        )
-
-    best = min((dict(theta) | dict(zip(near, row, strict=True)) for row in rows), key=away)
-    return {name: (best[name],) for name in near}
 
 
 def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: float) -> str:
@@ -343,7 +350,7 @@ def _halves(lists: Lists) -> list[Lists]:
     return [lists | {name: values[middle:]}, lists | {name: values[:middle]}]
 
 
-def _listed(
+def _describe_lists(
     problem: CoDesignProblem, best: Solution, nodes: list[Node], left: list[_Part], judged: int
 ) -> dict[str, Any]:
     whole = sum(node.whole for node in nodes)
@@ -368,7 +375,7 @@ def _listed(
     })  # fmt: skip
 
 
-def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+def _describe_terms(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     """Describe the terms of J: the bandwidth or the error, at the hardware cost."""
     if "hardware_cost" not in result:
         return ""
@@ -388,7 +395,7 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     above, free = found["objective_above_free"], ""
     if above is not None:
         far = f"{above:.3g} above" if above > 0.0 else "no worse than"
-        there, here = found["nodes"][0]["words"], _made_of(problem, result)
+        there, here = found["nodes"][0]["words"], _describe_terms(problem, result)
         figures = f" ({there} there, {here} here)" if there else ""
         free = f"; J is {far} the best with any value between them{figures}"
     counts = f"{found['solved']} of {plural(found['combinations'], 'combination')} searched"

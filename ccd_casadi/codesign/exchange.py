@@ -16,12 +16,17 @@ Source: exchange neighbourhoods of facility location (Cornuejols, Nemhauser and 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.inner_problem.objective import ConstraintOptions, constraint_sizes, objective_of
+from ccd_casadi.inner_problem.objective import (
+    ConstraintOptions,
+    constraint_shares,
+    constraint_sizes,
+    objective_of,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
@@ -41,10 +46,47 @@ class ExchangeOptions:
         Of the budget, after which no further exchange is tried.
     batch : int
         Exchanges that are evaluated at once, by any number of workers: the best of them is taken.
+    undecided : int
+        Lists of which two values are tried in the combination nearest to a θ.
     """
 
     share: float = 0.4
     batch: int = 8
+    undecided: int = 12
+
+
+def nearest_combination(
+    problem: CoDesignProblem,
+    theta: Mapping[str, float],
+    options: ExchangeOptions = ExchangeOptions(),
+) -> Values:
+    """The combination of listed values near a θ that keeps the constraints, with the least change
+    of these too: of places that are to be chosen in part."""
+    near = {name: sorted(values, key=lambda v: abs(v - theta[name]))[:2]
+            for name, values in problem.listed}  # fmt: skip
+
+    def undecided(name: str) -> float:
+        first, *second = (abs(value - theta[name]) for value in near[name])
+        return -second[0] / max(first, 1e-300) if second else -np.inf
+
+    both = set(sorted(near, key=undecided, reverse=True)[: options.undecided])
+    rows = product(*(near[name] if name in both else near[name][:1] for name in near))
+    width = np.subtract(problem.upper, problem.lower)
+
+    def shares(one: Mapping[str, float]) -> Array:
+        return constraint_shares(problem, np.array([one[name] for name in problem.names]))
+
+    here = shares(theta)
+
+    def away(one: Mapping[str, float]) -> tuple[float, float]:
+        there = shares(one)
+        moved = [abs(one[name] - theta[name]) for name in problem.names] / width
+        return float(there.max(initial=0.0)), float(
+            moved.sum() + len(near) * abs(there - here).sum()
+        )
+
+    best = min((dict(theta) | dict(zip(near, row, strict=True)) for row in rows), key=away)
+    return {name: best[name] for name in near}
 
 
 def best_exchange(

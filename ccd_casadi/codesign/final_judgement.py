@@ -47,7 +47,7 @@ from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 
 if TYPE_CHECKING:
     from ccd_casadi.fixed_structure.design import SectionsDesign
-    from ccd_casadi.lti.between_samples import BetweenSamples
+    from ccd_casadi.lti.norms import BetweenSamples
 
 
 def written_plants(
@@ -150,7 +150,7 @@ def between_on_set(
         return None
     if not all(figures.stable for figures in judged.plants):
         return None
-    from ccd_casadi.lti.between_samples import worst_between
+    from ccd_casadi.lti.norms import worst_between
 
     peaks = [figures.S_peak for figures in judged.plants]
     places = kind_of(problem).bounds().places

@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.codesign.formulations import Direct, Formulation
+from ccd_casadi.codesign.formulations import Direct, Formulation, Lifted, solve_lifted
 from ccd_casadi.codesign.gaussian_processes import with_sample
-from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import FormulationResult, KnownSamples, distinct
 from ccd_casadi.codesign.verified import Solution, Verified

@@ -232,7 +232,7 @@ class StructuredOuter(ThetaOuter):
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, design.kappa)
-            costs = sampler.cached("costs", best.theta, Costs, make)
+            costs = sampler.recall("costs", best.theta, Costs, make)
             known_gap = extensions.function("known_gap")
             gap = None if known_gap is None else known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()

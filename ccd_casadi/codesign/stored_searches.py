@@ -65,14 +65,14 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start needs.
             make = partial(ProblemAt(anchored, start).value_of, made, 1)
-            sampler.of(anchored).cached("race", start, StructuredValue, make)
+            sampler.of(anchored).recall("race", start, StructuredValue, make)
         bandwidth = made.bandwidth if made.certified else None
         return InitialSearch(
             own.warm_starts, own.scenarios, own.error_warm_starts, words, bandwidth
         )
 
     key = sample_key(owner, problem.start)
-    found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
+    found = sampler.store.recall(key, owner, problem.start, InitialSearch, searched)
     sampler.bandwidth_at_start = found.bandwidth
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
     return with_state(problem, **known, scenarios=found.members), found.words
@@ -105,7 +105,7 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
     sampler.count_multistart(sample_key(sampler.hash, theta))
-    return sampler.cached("race", theta, StructuredValue, multistart)
+    return sampler.recall("race", theta, StructuredValue, multistart)
 
 
 def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
@@ -125,7 +125,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """
     problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
     make = partial(structured_value, problem, best.theta, sampler.workers)
-    return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
+    return sampler.of(problem).recall("value", best.theta, StructuredValue, make)
 
 
 def printer(label: str, quiet: bool) -> Log:

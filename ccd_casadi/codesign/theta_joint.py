@@ -166,7 +166,7 @@ class JointState:
             propose_step, self.problem, self.plants.models, self.point, self.reach, least_gain,
             curved, options.model,
         )  # fmt: skip
-        found = self.working.sampler.cached(kind, key, Proposal, make)
+        found = self.working.sampler.recall(kind, key, Proposal, make)
         if report is not None and np.isfinite(self.objective):
             digits, step = ("6", "step") if least_gain is None else ("8", "last step")
             gain = max(found.gain, 0.0)

@@ -26,7 +26,7 @@ from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
 
 if TYPE_CHECKING:
-    from ccd_casadi.lti.between_samples import BetweenSamples
+    from ccd_casadi.lti.norms import BetweenSamples
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from ccd_casadi.synthesis.second_engine import NOT_COMPARED, EngineComparison
 from surrogates import GaussianProcess, Quality
 
 if TYPE_CHECKING:
-    from ccd_casadi.lti.between_samples import BetweenSamples
+    from ccd_casadi.lti.norms import BetweenSamples
 
 
 @dataclass(frozen=True, kw_only=True)

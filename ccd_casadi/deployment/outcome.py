@@ -19,8 +19,8 @@ from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
-from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.norms import BetweenSamples
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.support.arrays import Array

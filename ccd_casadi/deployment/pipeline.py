@@ -56,8 +56,8 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
-from ccd_casadi.lti.between_samples import worst_between
 from ccd_casadi.lti.loop import Sampling, zoh
+from ccd_casadi.lti.norms import worst_between
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -265,7 +265,7 @@ def judge_plants(
     found = [PlantFigures(False, one) for one in growth]
     if good:
         given = [plants[i] for i in good]
-        figures = _figures_of(every.only(good), given, bounds, integrator, options)
+        figures = _compute_figures(every.only(good), given, bounds, integrator, options)
         for i, own in zip(good, figures, strict=True):
             found[i] = own
     return found
@@ -289,7 +289,7 @@ def _grid_of(loops: LoopsAsRun, bounds: Bounds, options: JudgeOptions) -> Array:
     return pad(grids)
 
 
-def _figures_of(
+def _compute_figures(
     loops: LoopsAsRun, given: Sequence[StateSpace], bounds: Bounds, integrator: bool,
     options: JudgeOptions,
 ) -> list[PlantFigures]:  # fmt: skip
@@ -304,38 +304,30 @@ def _figures_of(
     else:
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(rows), 1), bounds.omega_low))
-    tops, growth = peaks(table, grid, values, options.curves), loops.growth
-    beyond_half_the_rate = np.zeros(len(rows))
-    if table.period is not None and table.free is not None and bounds.compliance_max is not None:
-        beyond, at = _compliance_beyond(table, loops.free, options)
-        larger = beyond > tops["GS"][0]
-        tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
-        beyond_half_the_rate = np.where(larger, at, 0.0)
-    for k, (S, G, plant) in enumerate(zip(loops.S, loops.G, given, strict=True)):
-        _raise_tops(tops, k, S, G, loops.K, bounds, table, plant)
+    tops, beyond = _find_tops(loops, given, bounds, table, grid, values, options)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
     whole = loops.S
     if bounds.error is not None:
         whole = [_entry(bounds.channels[bounds.error], S) for S in loops.S]
     norm, confirmed = norms(whole, table.period, *tops["S"])
-    channels: list[list[ChannelFigures]] = [[] for _ in rows]
+    channels: list[tuple[ChannelFigures, ...]] = [() for _ in rows]
     for one in bounds.channels:
         broken = loops.S
         if one.place is BrokenAt.ACTUATOR:
             broken = [_at_the_actuator(S, G, loops.K)
                       for S, G in zip(loops.S, loops.G, strict=True)]  # fmt: skip
-        of_rows, certain = _rows(one, broken, table, grid, values, tops, options.curves)
-        for k, figures in enumerate(of_rows):
-            channels[k].append(figures)
-            if one.bandwidth_ratio > 1.0:
-                bandwidth[k] = min(bandwidth[k], figures.bandwidth / one.bandwidth_ratio)
+        found, certain = _rows(one, broken, table, grid, values, tops, options.curves)
+        channels = [(*own, figures) for own, figures in zip(channels, found, strict=True)]
+        if one.bandwidth_ratio > 1.0:
+            share = np.array([figures.bandwidth for figures in found]) / one.bandwidth_ratio
+            bandwidth = np.fmin(bandwidth, share)  # NaN where the channel has none
         confirmed &= certain
     missing = np.full(len(rows), np.nan)
     weighted = [tops.get(name, (missing, missing))[0] for name in ("weighted KS", "weighted T")]
     return [
         PlantFigures(
             stable=True,
-            stability=growth[k],
+            stability=loops.growth[k],
             S_peak=float(norm[k]),
             S_peak_frequency=float(tops["S"][1][k]),
             S_low=float(low["S"][k, 0]),
@@ -344,17 +336,34 @@ def _figures_of(
             KS=float(tops["KS"][0][k]),
             T=float(tops["T"][0][k]),
             GS=float(tops["GS"][0][k]),
-            GS_beyond=float(beyond_half_the_rate[k]),
+            GS_beyond=float(beyond[k]),
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
             static_compliance=0.0 if integrator and not loops.driven else float(values["GS"][k, 0]),
             low_compliance=float(low["GS"][k, 0]),
             confirmed=bool(confirmed[k]),
-            channels=tuple(channels[k]),
+            channels=channels[k],
         )
         for k in rows
     ]
+
+
+def _find_tops(
+    loops: LoopsAsRun, given: Sequence[StateSpace], bounds: Bounds, table: LoopResponses,
+    grid: Array, values: dict[str, Array], options: JudgeOptions,
+) -> tuple[dict[str, tuple[Array, Array]], Array]:  # fmt: skip
+    """The largest of every gain and its ω (P,) by name, and the ω beyond half the rate at which a
+    force moves most (P,), else 0."""
+    tops, beyond_half_the_rate = peaks(table, grid, values, options.curves), np.zeros(len(given))
+    if table.period is not None and table.free is not None and bounds.compliance_max is not None:
+        beyond, at = _compliance_beyond(table, loops.free, options)
+        larger = beyond > tops["GS"][0]
+        tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
+        beyond_half_the_rate = np.where(larger, at, 0.0)
+    for k, (S, G, plant) in enumerate(zip(loops.S, loops.G, given, strict=True)):
+        _raise_tops(tops, k, S, G, loops.K, bounds, table, plant)
+    return tops, beyond_half_the_rate
 
 
 def _at_rest(table: LoopResponses, lowest: Array, options: JudgeOptions) -> Array:

@@ -20,8 +20,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, FrequencyAxis, axis_of, gain_of
 from ccd_casadi.fixed_structure.discs import GUARD, Discs, RankOneDiscs, discs_of, norm
-from ccd_casadi.fixed_structure.force_discs import ForceDiscs
-from ccd_casadi.fixed_structure.loop_discs import FigureBounds, LoopDiscs, row_lengths
+from ccd_casadi.fixed_structure.loop_discs import FigureBounds, ForceDiscs, LoopDiscs, row_lengths
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array

@@ -50,8 +50,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.step import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.lent_pool import LentWorkers
-from ccd_casadi.support.process_pool import Pool, Workers, results
+from ccd_casadi.support.process_pool import LentWorkers, Pool, Workers, results
 from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ, number, spoken
 from ccd_casadi.support.time_budget import ends_early

@@ -36,7 +36,7 @@ from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.modes import PlantSlopes
 from ccd_casadi.lti.loop import Sampling, delay_parts, in_w, moment_slopes, moments, with_delays
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
-from ccd_casadi.plants.rigid_modes import driven_and_measured, embed
+from ccd_casadi.plants.as_written import driven_and_measured, embed
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError

@@ -74,7 +74,7 @@ def digest_of(files: tuple[Path, ...]) -> str:
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def loaded_from(files: Iterable[Path]) -> list[str]:
+def find_loaded(files: Iterable[Path]) -> list[str]:
     """Names of modules in this process that come from these files."""
     known = set(files)
     return [name for name, place in _own_modules() if place in known] if known else []
@@ -267,11 +267,11 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
         require_user_code(source.name)
     elif source.motion is None and source.places is None and not source.wiring:
         lower = upper = ()  # a shipped model is the same in any box
-    return _built(source.pin(), names, lower, upper)
+    return _build(source.pin(), names, lower, upper)
 
 
 @lru_cache(maxsize=24)
-def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
+def _build(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     """Build the plant by its move, its places or its fixed parameters from the plant below."""
     if source.motion is not None:
         motion = source.motion
@@ -364,7 +364,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
     if digest_of(files) != source.content:
         words = "it or a file that it depends on was changed since the case was read"
         raise UserError(f"{path}: {words}; give the command again")
-    for name in loaded_from(files[1:]):
+    for name in find_loaded(files[1:]):
         del sys.modules[name]  # it may be of an older text
     before, kept = list(sys.modules), sys.dont_write_bytecode
     spec = importlib.util.spec_from_loader(loader.name, loader)

@@ -37,7 +37,7 @@ from ccd_casadi.kernels.adjoint import (
 )
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
-from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.generalized_plant import generalized_plant, unstable_modes, unstable_plant
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, stable_subspace
 from ccd_casadi.kernels.riccati import (
     RiccatiOptions,
@@ -51,7 +51,6 @@ from ccd_casadi.kernels.riccati_synthesis import (
     innovations_plant,
 )
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant
 from ccd_casadi.support.arrays import Array
 
 

@@ -16,6 +16,9 @@ from ccd_casadi.kernels.generalized_plant import (
     squared_weights,
     symmetric_part,
     transpose,
+    unstable_modes,
+    unstable_plant,
+    without_copies,
 )
 from ccd_casadi.kernels.linear_algebra import solve, stable_subspace
 from ccd_casadi.kernels.riccati import (
@@ -27,7 +30,6 @@ from ccd_casadi.kernels.riccati import (
     rounding_noise,
 )
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant, without_copies
 
 
 class RiccatiSynthesisOptions(NamedTuple):

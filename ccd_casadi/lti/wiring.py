@@ -259,7 +259,7 @@ class Wiring:
         a, s = len(act.A), len(sen.A)
         size, own, behind = a + n + s, slice(a, a + n), slice(a + n, a + n + s)
 
-        def placed(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+        def place(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
             """A, B, C of the mechanics, or of their derivatives, in the states of all."""
             lead = A.shape[:-2]
             whole, into = np.zeros((*lead, size, size)), np.zeros((*lead, size, m))
@@ -270,10 +270,10 @@ class Wiring:
             out[..., own] = sen.D[:, :read] @ C
             return whole, into, out
 
-        A, B, C = placed(plant.A, plant.B, plant.C)
+        A, B, C = place(plant.A, plant.B, plant.C)
         A[:a, :a], B[:a] = act.A, act.B
         A[behind, behind], C[:, behind], C[:, :a] = sen.A, sen.C, sen.D @ plant.D @ act.C
-        dA, dB, dC = placed(*slopes)
+        dA, dB, dC = place(*slopes)
         bodies = np.flatnonzero(~plant.A.any(axis=0))
         if len(bodies):
             rates = (plant.A[bodies] != 0.0).argmax(axis=1)

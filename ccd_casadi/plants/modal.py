@@ -20,9 +20,9 @@ import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.lti.wiring import UNWIRED, Slopes, Wiring
+from ccd_casadi.plants.as_written import driven_and_measured, embed, natural_modes, number_modes
 from ccd_casadi.plants.first_order import FirstOrderPlant, first_order
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import driven_and_measured, embed, natural_modes, number_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 

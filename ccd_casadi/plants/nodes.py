@@ -5,7 +5,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from ccd_casadi.plants.rigid_modes import natural_modes
+from ccd_casadi.plants.as_written import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 

@@ -16,6 +16,7 @@ import scipy
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE, ModeShape, ModeShapes
+from ccd_casadi.plants.as_written import natural_modes
 from ccd_casadi.plants.fixed_parameters import reparametrise
 from ccd_casadi.plants.nodes import (
     NodeInterpolation,
@@ -27,7 +28,6 @@ from ccd_casadi.plants.nodes import (
     names_in,
 )
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
-from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.text import HZ

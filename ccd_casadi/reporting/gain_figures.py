@@ -173,7 +173,7 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
             own, found["bands"] = of_plants(view.hz, size)
             curves.append(replace(own[0], label=view.label or own[0].label))
         else:
-            label = view.label or view.named(name)
+            label = view.label or view.name_gain(name)
             curves.append(Curve(view.hz, size.max(axis=0), label, colour))
         if bounds and np.isfinite(bound).any():
             words = view.bounded.words[i] if alone else ""
@@ -188,7 +188,7 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     if len(curves) == 1 and not found.get("bands"):
         found["legend"] = None
     first, ends = views[0], views[0].ends
-    label = f"{first.named(name)} ({spoken(UNITS[name])})"
+    label = f"{first.name_gain(name)} ({spoken(UNITS[name])})"
     if i == 0:
         b = first.bounded
         if alone:
@@ -234,7 +234,7 @@ def compliance_panel(view: LoopView) -> Panel:
     curves, bands = of_plants(view.hz, factor * view.sizes[3])
     words = f"compliance_max {with_unit(most or 0.0, spoken('m'))}{spoken('/N')}"
     levels = () if most is None else (Level(factor * most, words, colour=GREY),)
-    label = f"{view.named('GS')} ({unit}/N)"
+    label = f"{view.name_gain('GS')} ({unit}/N)"
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 
@@ -301,7 +301,7 @@ def _peak_marks(tops: Sequence[tuple[float, float]], colour: str, of: str = "") 
 def gains(view: LoopView) -> Figure:
     """S, KS and T of one design with their words."""
     near = [
-        (view.named(name), 100.0 * share[i], view.bounded.words[k], float(view.hz[i]))
+        (view.name_gain(name), 100.0 * share[i], view.bounded.words[k], float(view.hz[i]))
         for k, (name, share) in enumerate(zip(NAMES, view.shares, strict=True))
         if np.isfinite(share).any()
         for i in [int(np.nanargmax(share))]

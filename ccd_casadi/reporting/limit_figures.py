@@ -285,7 +285,7 @@ def _panels(loops: Sequence[LoopView]) -> tuple[tuple[c.Panel, ...], ...]:
         levels=(c.Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
     )  # fmt: skip
     S = gain_panels(loops, bounds=False)[0]
-    return (S,), (over_hz(spoken(f"{loops[0].named('G')} (m/N)"), G, loops[0].ends), pole_map)
+    return (S,), (over_hz(spoken(f"{loops[0].name_gain('G')} (m/N)"), G, loops[0].ends), pole_map)
 
 
 def _start_table(

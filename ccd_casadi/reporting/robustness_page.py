@@ -139,7 +139,7 @@ def _margins(found: Study) -> c.Chapter:
 def _gains(found: Study) -> c.Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
-        (found.view.named(name),
+        (found.view.name_gain(name),
          with_unit(peak, spoken(unit), 5) + spoken("/N") * (name == "GS") if unit else number(peak),
          _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)

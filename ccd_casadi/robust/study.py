@@ -41,7 +41,7 @@ from ccd_casadi.robust.perturbed import (
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.terminal import kept_quiet
+from ccd_casadi.support.terminal import keep_quiet
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.statics import Statics, statics_of
@@ -113,7 +113,7 @@ def robustness(
     Study
         The content of robustness.json.
     """
-    with kept_quiet(quiet):
+    with keep_quiet(quiet):
         return _study(run, demands or Demands(), seed, workers)
 
 

@@ -273,16 +273,16 @@ class Sampler:
         """The true quantities at any x, for IPOPT and what polishes: made in this process."""
         return TrueQuantities(self.problem, self._record)
 
-    def cached(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
+    def recall(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
         """Return the value of `make` at a point of this problem, made once for all runs on the
         store."""
         owner = problem_hash({what: self.inner_hash})
-        return self.store.cached(sample_key(owner, point), owner, point, kind, make)
+        return self.store.recall(sample_key(owner, point), owner, point, kind, make)
 
     def _record(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
         """A design made outside the pool (IPOPT on the true function): a row too, and counted."""
         point = tuple(float(v) for v in x)
-        design = self.cached("design", point, Sensitivities, make)
+        design = self.recall("design", point, Sensitivities, make)
         key = self._design_key(point)
         sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)

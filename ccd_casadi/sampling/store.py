@@ -262,7 +262,7 @@ class SampleStore(AbstractContextManager["SampleStore"]):
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
             return None if row is None else decode(row[0])
 
-    def cached(
+    def recall(
         self, key: str, owner: str, theta: Sequence[float], kind: type[T], make: Callable[[], T]
     ) -> T:
         """The dataclass that was stored under a key, else what `make` gives, which is stored unless

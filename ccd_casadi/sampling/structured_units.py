@@ -19,8 +19,7 @@ from ccd_casadi.inner_problem.structured_problem import with_structured
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.units import InnerUnits, Retry, Theta, Unit, json_number
-from ccd_casadi.support.lent_pool import LentWorkers
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import LentWorkers, Pool
 
 
 @dataclass(frozen=True)

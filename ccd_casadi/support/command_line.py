@@ -36,7 +36,7 @@ from ccd_casadi.support.options import (
     usable_cores,
 )
 from ccd_casadi.support.options import option as option
-from ccd_casadi.support.terminal import kept_quiet, say
+from ccd_casadi.support.terminal import keep_quiet, say
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import (
     WorkerLost,
@@ -244,7 +244,7 @@ def run(
             one_blas_thread,
             threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
-            kept_quiet(options.quiet),
+            keep_quiet(options.quiet),
             ctrl_c_noticed(),
         ):
             began = perf_counter()

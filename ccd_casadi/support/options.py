@@ -168,7 +168,9 @@ def option(*names: str, **how: Any) -> Option:
     return lambda arguments: arguments.add_argument(*names, **how)
 
 
-def valued(name: str, metavar: str, kind: Callable[[str], Any], words: str, default: Any) -> Option:
+def take_value(
+    name: str, metavar: str, kind: Callable[[str], Any], words: str, default: Any
+) -> Option:
     """Make an option with a value; its help ends with the default.
 
     Parameters

@@ -163,7 +163,7 @@ def remark(text: str, quiet: bool) -> None:
 
 
 @contextmanager
-def kept_quiet(yes: bool) -> Iterator[None]:
+def keep_quiet(yes: bool) -> Iterator[None]:
     """Silence `inform` and progress bars within the block.
 
     Parameters

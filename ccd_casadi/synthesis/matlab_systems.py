@@ -1,16 +1,14 @@
-"""Linear systems as MATLAB and python-control write them: realisations, compared with their
-source."""
+"""Linear systems as MATLAB's files hold them, and whether their matrices are of discrete time."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
-from scipy.linalg import block_diag
 
-from ccd_casadi.lti.state_space import StateSpace, balance_system
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.table_columns import SI as UNITS_OF_SI
 from ccd_casadi.plants.table_columns import (
     compliance_of,
@@ -21,137 +19,52 @@ from ccd_casadi.plants.table_columns import (
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.synthesis.time_base import HINT, appears_discrete
 
 if TYPE_CHECKING:
-    import control
+    pass
 
 
 @dataclass(frozen=True)
-class RealisationOptions:
-    """Numbers by which a realisation is compared with its polynomials."""
+class TimeBaseOptions:
+    """Numbers by which a discrete A is known from its eigenvalues."""
 
-    beside: float = 1.01  # frequency over that of a root, and below, where responses are compared
-    beyond: float = 30.0  # of the outermost roots: ends of the grid
-    points: int = 200  # of the grid
-    numerator_error: float = 1e-6  # relative, of coefficients: what is allowed
-    denominator_error: float = 1e-9
-    unstable: float = 1e-4  # Re p over |p| that counts
-    at_rest: float = 1e-6  # |p| over the largest that is 0
+    outside: float = 1e-3  # what |λ| may exceed 1 by: rounding, and slow unstable poles
+    near: float = 0.8  # |λ| from which an eigenvalue lies near the unit circle
+    share: float = 0.5  # of all eigenvalues: more are near the circle with a positive real part
+    least: int = 2  # states: one eigenvalue alone shows nothing
 
 
-def realise(system: "control.TransferFunction") -> StateSpace:
-    """A state space with this response and its poles. Raises UserError where there is none."""
-    import control
-
-    num, den = _polynomials(system)
-    if any(len(n) > len(d) for n, d in zip(num.flat, den.flat, strict=True)):
-        raise UserError("the system has no state space: more zeros than poles; make it proper")
-    period = float(system.dt or 0.0)
-
-    def by_library() -> StateSpace:
-        space = control.ss(system)
-        return StateSpace(space.A, space.B, space.C, space.D, period=period)
-
-    ways: list[Callable[[], StateSpace]] = [by_library, lambda: _by_columns(num, den, period)]
-    for way in ways if num.size > 1 else ways[1:]:
-        try:
-            found = way()
-        except (ValueError, np.linalg.LinAlgError, control.ControlMIMONotImplemented):
-            continue
-        if _same(num, den, found):
-            return found
-    words = "no state space has its response and poles to six digits"
-    raise UserError(f"the transfer function is lost in conversion: {words}; give A, B, C, D")
+HINT = "the matrices appear discrete: all eigenvalues within the unit circle, most of them near 1"
 
 
-def _polynomials(system: "control.TransferFunction") -> tuple[np.ndarray, np.ndarray]:
-    """Numerators and denominators (p, m) of object, without leading zeros, denominators monic."""
-    p, m = system.noutputs, system.ninputs
-    num, den = np.empty((p, m), object), np.empty((p, m), object)
-    for i, j in np.ndindex(p, m):
-        n, d = (np.asarray(part[i][j], float) for part in (system.num, system.den))
-        if not (np.isfinite(n).all() and np.isfinite(d).all()):
-            raise UserError("a coefficient of the transfer function is not a finite number")
-        d = np.trim_zeros(d, "f")
-        num[i, j], den[i, j] = np.trim_zeros(n, "f") / d[0], d / d[0]
-    return num, den
+def appears_discrete(A: Array, options: TimeBaseOptions = TimeBaseOptions()) -> bool:
+    """Report whether A is likely one of discrete time.
 
+    e^(pT) of a plant that is sampled fast enough lies near 1. The same numbers as poles in 1/s
+    would be unstable nearly all, and all slower than 1 rad/s.
 
-def _by_columns(num: np.ndarray, den: np.ndarray, period: float) -> StateSpace:
-    """Realise in controllable companion form, one for each denominator of a column, balanced."""
-    p, m = num.shape
-    blocks, drive, reading, D = [], [], [], np.zeros((p, m))
-    for j in range(m):
-        alike: dict[tuple[float, ...], list[int]] = {}
-        for i in range(p):
-            alike.setdefault(tuple(den[i, j]), []).append(i)
-        for d, rows in alike.items():
-            n = len(d) - 1
-            C = np.zeros((p, n))
-            for i in rows:
-                full = np.concatenate([np.zeros(n + 1 - len(num[i, j])), num[i, j]])
-                D[i, j] = full[0]
-                C[i] = full[1:] - full[0] * np.array(d[1:])
-            A, B = np.eye(n, k=-1), np.zeros((n, m))
-            if n:
-                A[0], B[0, j] = -np.array(d[1:]), 1.0
-            A, B, C = balance_system(A, B, C) if n else (A, B, C)
-            blocks.append(A)
-            drive.append(B)
-            reading.append(C)
-    A = block_diag(*blocks)[: sum(map(len, blocks))]
-    return StateSpace(A, np.vstack(drive), np.hstack(reading), D, period=period)
+    Parameters
+    ----------
+    A : (n, n) array
+    options : TimeBaseOptions
 
+    Returns
+    -------
+    bool
 
-def _same(
-    num: np.ndarray,
-    den: np.ndarray,
-    found: StateSpace,
-    options: RealisationOptions = RealisationOptions(),
-) -> bool:
-    """Whether response and poles are those of the polynomials."""
-    if not all(np.isfinite(part).all() for part in (found.A, found.B, found.C, found.D)):
+    Examples
+    --------
+    >>> appears_discrete(np.array([[1.0, 0.001], [0.0, 0.99]]))
+    True
+    >>> appears_discrete(np.array([[0.0, 1.0], [-1.0, -0.1]]))
+    False
+    """
+    if len(A) < options.least:
         return False
-    each = [np.roots(d) for d in den.flat]
-    unstable = [_unstable(poles, found.period, options) for poles in each]
-    own = _unstable(found.poles, found.period, options)
-    if num.size == 1:
-        if len(found.A) != len(each[0]) or own != unstable[0]:
-            return False
-    elif not max(unstable) <= own <= sum(unstable):
-        return False
-    roots = np.concatenate([*each, *(np.roots(n) for n in num.flat)])
-    omega = _frequencies(found.rates_of(roots), found.period, options)
-    s = found.variable(omega)
-    response = found.response(omega)
-    for (i, j), n in np.ndenumerate(num):
-        d = den[i, j]
-        below, above = np.polyval(d, s), np.polyval(n, s)
-        size, spread = np.abs(below), np.polyval(np.abs(d), np.abs(s))
-        allowed = options.numerator_error * np.polyval(np.abs(n), np.abs(s))
-        allowed += options.denominator_error * np.abs(above) * spread / size
-        allowed = allowed / size
-        if not (np.abs(response[:, i, j] - above / below) <= allowed).all():
-            return False
-    return True
-
-
-def _unstable(poles: np.ndarray, period: float, options: RealisationOptions) -> int:
-    if period:
-        return int((np.abs(poles) > 1.0 + options.unstable).sum())
-    away = np.abs(poles) > options.at_rest * np.abs(poles).max(initial=0.0)
-    return int((away & (poles.real > options.unstable * np.abs(poles))).sum())
-
-
-def _frequencies(rates: np.ndarray, period: float, options: RealisationOptions) -> Array:
-    """About every root, and in between, in rad/s."""
-    size = np.abs(rates)[np.abs(rates) > 0.0]
-    size = np.append(size, [1.0 / period] if period else [] if len(size) else [1.0])
-    top = size.max() * options.beyond
-    grid = np.geomspace(size.min() / options.beyond, top, options.points)
-    omega = np.concatenate([grid, size * options.beside, size / options.beside])
-    return np.unique(omega[omega <= (0.999 * np.pi / period if period else top)])
+    roots = np.linalg.eigvals(A)
+    size = np.abs(roots)
+    usual = (size >= options.near) & (roots.real > 0.0)
+    return bool(size.max() <= 1.0 + options.outside and usual.mean() > options.share)
 
 
 PARTS = ("A", "B", "C", "D")

@@ -7,8 +7,8 @@ import numpy as np
 
 from ccd_casadi.kernels.certified_design import design, judge
 from ccd_casadi.kernels.certified_design import sweep as _sweep
+from ccd_casadi.kernels.generalized_plant import unstable_part
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.unstable_plant import unstable_part
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -316,7 +316,7 @@ def over_family(
         return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scale(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
-    def assessed(member: ScaledPlant, gamma: float) -> Array:
+    def assess(member: ScaledPlant, gamma: float) -> Array:
         own = row.copy()
         loop = (member.A, member.B, member.C, *controller, Dk)
         judge(*loop, w, weights.delta, gamma, omega_low / w0, own)
@@ -324,7 +324,7 @@ def over_family(
 
     own, worst = row.copy(), plant
     for member in plant.members[1:]:
-        other = assessed(member, CertificateOptions().unbounded)
+        other = assess(member, CertificateOptions().unbounded)
         if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
             figures = figures_from_row(own, weights, w0)
             return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member

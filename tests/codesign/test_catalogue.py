@@ -20,8 +20,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.catalogue import best_of_lists, restrict
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.outer_search import search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter

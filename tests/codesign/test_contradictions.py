@@ -12,8 +12,7 @@ from oracles.helpers import problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure.structure import Structure

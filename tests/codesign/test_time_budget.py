@@ -14,7 +14,7 @@ from oracles import fuzz_budget
 from oracles.kinds import kinds
 
 import ccd_casadi as ccd
-from ccd_casadi.codesign.catalogue import BranchOptions, _nearest
+from ccd_casadi.codesign.exchange import nearest_combination
 from ccd_casadi.codesign.verdict import clauses_of
 from ccd_casadi.support import time_budget
 from ccd_casadi.support.process_pool import Workers, results
@@ -134,9 +134,9 @@ LIST = (58.0, 59.5, 61.0, 62.0)
 @given(st.floats(58.0, 62.0), st.floats(58.0, 62.0))
 def test_a_combination_near_a_theta_is_of_its_lists(m1: float, m2: float) -> None:
     own = replace(kinds()["mixed"], listed=(("m1", LIST), ("m2", LIST[:2])))
-    found = _nearest(own, {"m1": m1, "m2": m2}, BranchOptions())
+    found = nearest_combination(own, {"m1": m1, "m2": m2})
     for name, value, values in (("m1", m1, LIST), ("m2", m2, LIST[:2])):
-        assert abs(found[name][0] - value) == min(abs(one - value) for one in values)
+        assert abs(found[name] - value) == min(abs(one - value) for one in values)
 
 
 def test_of_lists_a_combination_is_designed_in_any_time(clock: Clock) -> None:

@@ -16,7 +16,7 @@ from ccd_casadi.__main__ import commands
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
-from ccd_casadi.inner_problem.plant_source import _built
+from ccd_casadi.inner_problem.plant_source import _build
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.retrain import formulation_in
 from ccd_casadi.solve import main as solve
@@ -117,7 +117,7 @@ def test_an_edited_plant_is_not_the_one_kept_in_memory(trap: Path) -> None:
     assert float(plant_of(second).hardware([60.0, 60.0])[0]) == 420.0
     assert plant_of(first).hardware is before
     copied = pickle.loads(pickle.dumps(first))  # as a worker gets it
-    _built.cache_clear()
+    _build.cache_clear()
     with pytest.raises(UserError, match="was changed since the case was read"):
         plant_of(copied)
 

@@ -12,7 +12,6 @@ from oracles.sources import ROOT, SOURCES, nodes
 # Pipes between the processes of one run.
 LIVE = {
     "ccd_casadi/support/process_pool.py", "ccd_casadi/support/worker_process.py",
-    "ccd_casadi/support/lent_pool.py",
     "ccd_casadi/extensions/cluster/dask_pool.py",
 }  # fmt: skip
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
@@ -20,7 +19,7 @@ LIVE = {
 PROCESSES = {
     ("ccd_casadi/extensions/formats/code_formats.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/extensions/explorer/known_plant.py", "subprocess.Popen"),
+    ("ccd_casadi/extensions/explorer/session.py", "subprocess.Popen"),
     ("ccd_casadi/reporting/brief.py", "subprocess.run"),  # a browser that prints the page
     ("ccd_casadi/support/command_line.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }

@@ -17,8 +17,8 @@ from ccd_casadi.extensions.drives.drive_verdict import verdict_entry
 from ccd_casadi.extensions.drives.sheet import sheet_rows
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.lti.between_samples import BetweenSamples
 from ccd_casadi.lti.loop import Sampling, zoh
+from ccd_casadi.lti.norms import BetweenSamples
 from ccd_casadi.reporting.decision import Build, decide
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -17,21 +17,23 @@ from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import held_setpoint, simulate
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.extensions.feedforward.feedforward_files import (
-    OF_DESIGN,
-    improve,
-    read_error,
-    write_code,
-)
-from ccd_casadi.extensions.feedforward.least_time import ForceLimits, LeastTimeOptions, least_time
-from ccd_casadi.extensions.feedforward.move_responses import (
+from ccd_casadi.extensions.feedforward.coefficients import (
+    ForceLimits,
+    LeastTimeOptions,
     MoveResponses,
     Shape,
     contraction,
     learn,
     learning_gain,
     least_error,
+    least_time,
     responses_of,
+)
+from ccd_casadi.extensions.feedforward.feedforward_files import (
+    OF_DESIGN,
+    improve,
+    read_error,
+    write_code,
 )
 from ccd_casadi.extensions.feedforward.set_feedforward import FeedforwardSetOptions, _shapes
 from ccd_casadi.lti.loop import Loop, Sampling

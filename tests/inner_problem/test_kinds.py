@@ -17,8 +17,7 @@ from oracles.measured_files import written
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.codesign import outer_mixed, outer_structured
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.verified import Solution

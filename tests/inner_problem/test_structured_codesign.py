@@ -11,8 +11,7 @@ import pytest
 from oracles.kinds import PID, quick
 
 from ccd_casadi.codesign import stored_searches
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer import pieces_from
 from ccd_casadi.codesign.outer_structured import StructuredOuter

@@ -26,10 +26,9 @@ from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.given_controller import as_it_runs
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.extensions.feedforward import main as feedforward_main
-from ccd_casadi.extensions.feedforward.move_responses import Shape, responses_of
+from ccd_casadi.extensions.feedforward.coefficients import Shape, responses_of
 from ccd_casadi.extensions.limitations import main as gap_main
-from ccd_casadi.extensions.limitations.limits import discs
-from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
+from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis, discs
 from ccd_casadi.extensions.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for

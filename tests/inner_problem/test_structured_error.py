@@ -14,8 +14,7 @@ from oracles.kinds import CABLES, SLOW, least
 from ccd_casadi.budget.sources import ErrorBudget, ShapedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.stored_searches import with_initial_search

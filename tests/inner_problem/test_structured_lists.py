@@ -11,8 +11,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import stored_searches, structured_lists
 from ccd_casadi.codesign.catalogue import restrict
-from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import Direct, Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution

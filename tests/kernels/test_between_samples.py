@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ccd_casadi.lti.between_samples import held_between, peak_between, sensitivity_between
 from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.lti.norms import held_between, peak_between, sensitivity_between
 from ccd_casadi.lti.ports import BreakPoint
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 

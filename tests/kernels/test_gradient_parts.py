@@ -12,8 +12,12 @@ from oracles.helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
 from ccd_casadi.kernels import adjoint
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, plant_gain
-from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
-from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant
+from ccd_casadi.kernels.generalized_plant import (
+    generalized_plant,
+    squared_weights,
+    unstable_modes,
+    unstable_plant,
+)
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.weights import Weights

@@ -10,9 +10,9 @@ import mpmath as mp
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.as_written import natural_modes
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 

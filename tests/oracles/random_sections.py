@@ -38,7 +38,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.extensions.limitations.bound import forbids
-from ccd_casadi.extensions.limitations.limits import limits_of
+from ccd_casadi.extensions.limitations.of_problem import limits_of
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import JudgeOptions

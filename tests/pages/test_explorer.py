@@ -18,7 +18,7 @@ from ccd_casadi.extensions.explorer.curves import (
     FIGURES,
     as_sampled,
     curves_of,
-    drawn,
+    draw_design,
     machine_html,
     move_words,
     sampled_of,
@@ -33,9 +33,8 @@ from ccd_casadi.extensions.explorer.designs import (
     present,
 )
 from ccd_casadi.extensions.explorer.knobs import Notch, Problems, case_at, judge_notched, knobs_of
-from ccd_casadi.extensions.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.extensions.explorer.pins import landscape_of, steepest_axes
-from ccd_casadi.extensions.explorer.session import Session
+from ccd_casadi.extensions.explorer.session import KnownPlant, Session, frequency_error
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.places import Places
@@ -244,7 +243,7 @@ def test_margins_are_drawn_where_the_loop_has_them(session):
     assert min(turned, 360.0 - turned) < 1.0  # read off the grid's straight pieces
     gap = phase.curves[-1].y
     assert abs(gap[0] - gap[1]) == pytest.approx(view.margins.phase_deg, abs=1.0)
-    drawn_too = drawn(design, curves_of(design), None).panels
+    drawn_too = draw_design(design, curves_of(design), None).panels
     assert drawn_too["L"].marks == size.marks  # what a page shows is what the explorer shows
 
 
@@ -252,7 +251,7 @@ def test_every_panel_can_be_painted_marks_with_words_alone_too(session, searched
     painter = pytest.importorskip(
         "ccd_casadi.extensions.explorer.painter", reason="bokeh is not installed"
     )
-    panels = drawn(searched_look, curves_of(searched_look), None).panels
+    panels = draw_design(searched_look, curves_of(searched_look), None).panels
     assert any(mark.text and not mark.marker for p in panels.values() for mark in p.marks)
     for name, (heading, log_x, log_y) in FIGURES.items():
         panel = panels[name]

@@ -11,10 +11,9 @@ from bokeh.document import Document
 from oracles.case_documents import QUICK_SECTIONS
 
 from ccd_casadi.cases.case import load_case
-from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.page import ExplorerPage
 from ccd_casadi.extensions.explorer.pins import Kept
-from ccd_casadi.extensions.explorer.session import Session
+from ccd_casadi.extensions.explorer.session import Background, Session, Solve
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.worker_process import WorkerLost
 

@@ -8,10 +8,10 @@ from scipy.io import mmwrite
 from scipy.sparse import csc_array
 
 from ccd_casadi.extensions.imported import main
-from ccd_casadi.extensions.imported.matrices import modes_of
 from ccd_casadi.extensions.imported.matrix_files import MATRIX_FORMATS, read_matrix
 from ccd_casadi.extensions.imported.modal_table import read_modal_table
 from ccd_casadi.extensions.imported.result_files import RESULT_FORMATS, read_modes
+from ccd_casadi.extensions.imported.sampled_plant import modes_of
 from ccd_casadi.support.errors import PlantError
 
 NODES = ((4, 1), (4, 2), (11, 1), (11, 3), (7, 6))

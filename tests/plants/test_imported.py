@@ -18,14 +18,13 @@ from scipy.sparse import coo_array, csc_array, save_npz
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.extensions.imported.interpolation import ANY, InterpolatedModes
-from ccd_casadi.extensions.imported.matrices import modes_of, reduced_table
 from ccd_casadi.extensions.imported.modal_table import (
     ModalTable,
     frames,
     read_modal_table,
     write_modal_table,
 )
-from ccd_casadi.extensions.imported.sampled_plant import plant_of_table
+from ccd_casadi.extensions.imported.sampled_plant import modes_of, plant_of_table, reduced_table
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.errors import PlantError

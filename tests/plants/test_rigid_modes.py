@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from ccd_casadi.lti.loop import zoh
 from ccd_casadi.lti.state_space import StateSpace, balance_system, closed_loop
-from ccd_casadi.plants.as_written import as_written
+from ccd_casadi.plants.as_written import as_written, driven_and_measured, natural_modes
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 

@@ -12,9 +12,8 @@ import pytest
 from oracles.busy import HANGS
 
 from ccd_casadi.support import worker_process
-from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.options import usable_cores
-from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.process_pool import LentWorkers, Workers
 from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost, import_ahead
 
 HERE = Path(__file__).parent

@@ -75,7 +75,7 @@ def test_what_is_damaged_is_reported(tmp_path: Path) -> None:
         with SampleStore(tmp_path / "samples.sqlite") as store:
             store.put_unit([], (str(number), "owner", [0.0], data))
             with pytest.raises(SampleStoreError, match="a row is damaged"):
-                store.cached(str(number), "owner", [0.0], Whole, whole)
+                store.recall(str(number), "owner", [0.0], Whole, whole)
 
 
 def test_what_is_kept_is_made_once(tmp_path: Path) -> None:
@@ -87,5 +87,5 @@ def test_what_is_kept_is_made_once(tmp_path: Path) -> None:
 
     for _ in range(2):
         with SampleStore(tmp_path / "samples.sqlite") as store:
-            assert store.cached("key", "owner", [0.0], One, make) == One(0.1)
+            assert store.recall("key", "owner", [0.0], One, make) == One(0.1)
     assert len(made) == 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ccd_casadi.extensions.schedule.rate_bound import borders, modes_of, rate_bound
+from ccd_casadi.extensions.schedule.handover import borders, modes_of, rate_bound
 from ccd_casadi.support.arrays import Array
 
 PERIOD, PATHS, PLACES = 1e-3, 50, np.linspace(0.0, 1.0, 101)

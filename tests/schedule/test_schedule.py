@@ -16,8 +16,13 @@ from oracles.case_documents import QUICK_SECTIONS
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.extensions.schedule import main
-from ccd_casadi.extensions.schedule.handover import RateTrial, controllers_of, handovers, part_at
-from ccd_casadi.extensions.schedule.rate_bound import RateBound
+from ccd_casadi.extensions.schedule.handover import (
+    RateBound,
+    RateTrial,
+    controllers_of,
+    handovers,
+    part_at,
+)
 from ccd_casadi.extensions.schedule.schedule_files import Schedule, write_code
 from ccd_casadi.extensions.schedule.segments import (
     Alone,

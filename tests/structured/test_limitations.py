@@ -24,18 +24,18 @@ from ccd_casadi.extensions.limitations.bound import (
     support_of,
     upper_bound,
 )
-from ccd_casadi.extensions.limitations.limits import (
+from ccd_casadi.extensions.limitations.multiplier import (
     Limits,
+    MultiplierBasis,
     circle,
     discs,
-    limits_of,
     ratio,
     response_of,
 )
-from ccd_casadi.extensions.limitations.multiplier import MultiplierBasis
 from ccd_casadi.extensions.limitations.of_problem import (
     classic_limits,
     gap_of,
+    limits_of,
     limits_of_problem,
     none_reaches,
     opposite_corners,

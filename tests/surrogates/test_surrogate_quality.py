@@ -12,6 +12,7 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.formulations import fit_quantities, update_quantities
 from ccd_casadi.codesign.gaussian_processes import (
     best_left_out,
     kernels_of,
@@ -19,7 +20,6 @@ from ccd_casadi.codesign.gaussian_processes import (
     recommendation,
     surrogate_quality,
 )
-from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.retraining import stored_designs
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH

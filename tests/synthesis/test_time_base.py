@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from ccd_casadi.extensions.measured.tuned_plants import read_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control, read_mat
-from ccd_casadi.synthesis.time_base import appears_discrete
+from ccd_casadi.synthesis.matlab_systems import appears_discrete
 
 MODES = st.lists(st.floats(1.0, 1e4), min_size=0, max_size=4, unique=True)  # rad/s
 

@@ -15,11 +15,11 @@ from scipy.linalg import block_diag
 
 from ccd_casadi.kernels.certified_design import design
 from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.kernels.generalized_plant import unstable_modes, unstable_plant, without_copies
 from ccd_casadi.kernels.riccati import lqr_hamiltonian
 from ccd_casadi.kernels.riccati_synthesis import central_controller
 from ccd_casadi.kernels.riccati_synthesis import synthesise as made
 from ccd_casadi.kernels.sensitivity import Column
-from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant, without_copies
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledChannel, ScaledPlant, scale_state_space
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities

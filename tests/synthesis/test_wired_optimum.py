@@ -7,9 +7,8 @@ import pytest
 from oracles.hard_plants import distance_to_sb10ad, drawn_weights
 from oracles.wired_plants import KINDS, design_plant, machine
 
-from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.generalized_plant import generalized_plant, unstable_modes, unstable_plant
 from ccd_casadi.kernels.riccati import RiccatiOptions, lqr_hamiltonian, riccati_level
-from ccd_casadi.kernels.unstable_plant import unstable_modes, unstable_plant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.synthesis.synthesis import Design, Optimum, synthesise
 

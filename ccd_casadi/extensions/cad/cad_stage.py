@@ -281,7 +281,7 @@ class CadStage:
         for k, (face, axis) in enumerate(ports):
             block = slice(axis * nodes, (axis + 1) * nodes)
             F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
-        found = reduce_body(body, velocities, F, dF, self.modes, self._held(body))
+        found = reduce_body(body, velocities, F, dF, self.modes, self._mark_held(body))
         count = found.M.shape[0] - self.modes
         rows = [MOTIONS.index(name) for name in self.rigid] if count else []
         rows += range(count, count + self.modes)
@@ -300,7 +300,7 @@ class CadStage:
             ),
         )  # fmt: skip
 
-    def _held(self, body: Body) -> np.ndarray:
+    def _mark_held(self, body: Body) -> np.ndarray:
         """(3N,) the unknowns that are zero."""
         held = np.zeros((3, len(body.places)), dtype=bool)
         for face in self.held:
@@ -310,7 +310,7 @@ class CadStage:
     def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
         """The lowest flexible modes on the surface."""
         body = Body(self.morph.points(theta), self.morph.tets, self.material)
-        return mode_shapes(body, count, self._held(body))
+        return mode_shapes(body, count, self._mark_held(body))
 
     def drawing(self, thetas: Mapping[str, Sequence[float]]) -> Figure:
         """Stages by name; θ in the morph's order."""

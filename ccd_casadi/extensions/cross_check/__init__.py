@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING
 from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import break_frequencies, break_frequency_options, positive, valued
+from ccd_casadi.support.options import (
+    break_frequencies,
+    break_frequency_options,
+    positive,
+    take_value,
+)
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.text import HZ
 
@@ -63,7 +68,7 @@ def _problem(
     "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
     option("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file"),
     *break_frequency_options("of a weight (default: the best at theta, or the run's)"),
-    valued("--limit", "SECONDS", positive, "time limit of each optional back end", 60.0),
+    take_value("--limit", "SECONDS", positive, "time limit of each optional back end", 60.0),
     needs=["ccd_casadi.codesign.result", "ccd_casadi.extensions.cross_check.backends"],
     without_effect=["--seed"],
 )  # fmt: skip

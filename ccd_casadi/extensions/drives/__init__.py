@@ -11,7 +11,7 @@ from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, one_line, option, valued
+from ccd_casadi.support.options import integer, one_line, option, take_value
 from ccd_casadi.support.terminal import inform, remark, say
 
 EXTENSION = Extension(
@@ -32,7 +32,7 @@ EXTENSION = Extension(
     option("--codesign", action="store_true", help="search theta as well, by the case's objective"),
     option("--today", metavar="FILE.toml", type=Path,
            help="present values by number or name, shown beside the new ones"),
-    valued("--starts", "N", integer(1), "starting points of the search", 24),
+    take_value("--starts", "N", integer(1), "starting points of the search", 24),
     needs=["ccd_casadi.extensions.drives.drive_design", "ccd_casadi.cases.case_problem"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

@@ -22,9 +22,9 @@ from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.certificate import JudgeOptions, SetCertificate, certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.lti.between_samples import BetweenSamples, worst_between
 from ccd_casadi.lti.frequency_grid import local_maxima, zoom
 from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.lti.norms import BetweenSamples, worst_between
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

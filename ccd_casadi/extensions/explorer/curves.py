@@ -232,7 +232,7 @@ class Drawn:
     panels: Mapping[str, Panel]
 
 
-def drawn(
+def draw_design(
     design: ExploredDesign,
     c: Curves | None,
     sampled: AsSampled | None,

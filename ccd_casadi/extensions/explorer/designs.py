@@ -287,7 +287,7 @@ def design_controller(task: tuple[CoDesignProblem, Knobs], log: Log) -> Designed
     )
 
 
-def judged_design(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> ExploredDesign:
+def judge_design(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> ExploredDesign:
     """A known controller at θ, judged on the model and the corners of its plant set."""
     began = perf_counter()
     controller = structure_of(problem).state_space(kappa)

@@ -30,7 +30,7 @@ from ccd_casadi.extensions.explorer.curves import (
     STYLES,
     Drawn,
     curves_of,
-    drawn,
+    draw_design,
     machine_html,
     move_words,
     sampled_of,
@@ -45,7 +45,6 @@ from ccd_casadi.extensions.explorer.designs import (
     with_warm_starts_of,
 )
 from ccd_casadi.extensions.explorer.knobs import Knobs
-from ccd_casadi.extensions.explorer.known_plant import Background, Solve
 from ccd_casadi.extensions.explorer.painter import (
     ON_DARK,
     Message,
@@ -61,7 +60,7 @@ from ccd_casadi.extensions.explorer.pins import (
     run_surrogate,
     steepest_axes,
 )
-from ccd_casadi.extensions.explorer.session import Session, search_exactly
+from ccd_casadi.extensions.explorer.session import Background, Session, Solve, search_exactly
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -238,7 +237,7 @@ class ExplorerPage:
         design, curves, sampled = self._shown
         session, view = self.session, None if curves is None else curves.view
         notched = None if view is None else self.notch.of(view)
-        self.now = now = drawn(design, curves, sampled, notched)
+        self.now = now = draw_design(design, curves, sampled, notched)
         self._serial += 1
         answer = {
             "serial": [self._serial],

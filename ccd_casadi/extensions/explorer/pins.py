@@ -247,7 +247,7 @@ class Pins:
         units = [display_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
         self.source = ColumnDataSource(self._columns([]))
-        self.source.on_change("data", lambda attr, old, new: self._renamed(new["design"]))
+        self.source.on_change("data", lambda attr, old, new: self._rename(new["design"]))
         thetas = [
             (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000", 90)
             for name, (unit, _) in zip(self.names, units, strict=True)
@@ -276,19 +276,19 @@ class Pins:
 
     def drop(self) -> None:
         """Take the selected ones away, the last one where none is selected."""
-        chosen = set(self._chosen()) or {len(self.pinned) - 1}
+        chosen = set(self._list_selected()) or {len(self.pinned) - 1}
         self.pinned[:] = [pin for i, pin in enumerate(self.pinned) if i not in chosen]
         self._show()
 
     def first_selected(self) -> Drawn | None:
         """The first of those selected, the last one where none is; None without a pin."""
-        chosen = self._chosen() or ([len(self.pinned) - 1] if self.pinned else [])
+        chosen = self._list_selected() or ([len(self.pinned) - 1] if self.pinned else [])
         return self.pinned[chosen[0]][1] if chosen else None
 
-    def _chosen(self) -> list[int]:
+    def _list_selected(self) -> list[int]:
         return [i for i in self.source.selected.indices if i < len(self.pinned)]
 
-    def _renamed(self, names: Sequence[str]) -> None:
+    def _rename(self, names: Sequence[str]) -> None:
         if len(names) == len(self.pinned):
             pairs = zip(names, self.pinned, strict=True)
             self.pinned[:] = [(str(name), drawn) for name, (_, drawn) in pairs]

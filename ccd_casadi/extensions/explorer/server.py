@@ -21,10 +21,9 @@ from tornado.web import StaticFileHandler
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.extensions.explorer.curves import FIGURES
 from ccd_casadi.extensions.explorer.designs import design_controller
-from ccd_casadi.extensions.explorer.known_plant import Background
 from ccd_casadi.extensions.explorer.page import SOLVED, ExplorerPage
 from ccd_casadi.extensions.explorer.pins import Kept
-from ccd_casadi.extensions.explorer.session import Session
+from ccd_casadi.extensions.explorer.session import Background, Session
 
 HOST = "127.0.0.1"
 TEMPLATE = Path(__file__).with_name("page.html")

@@ -12,7 +12,7 @@ from ccd_casadi.robust import MOVE_OPTIONS, move_of
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, one_line, option, valued
+from ccd_casadi.support.options import integer, one_line, option, take_value
 from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:
@@ -43,9 +43,9 @@ FILE = "feedforward.json"
            help="improve the coefficients in the folder by the error of a move of the machine: "
            "CSV with a line for each sample and a column `error`, or error1, error2, ...: the "
            "controller's error in m; a column `time` in s has to be of its samples"),
-    valued("--taps", "N", integer(1, 9), "of the shaper at most; 1: none", 3),
-    valued("--judges", "N", integer(1), "plants of the set that judge the design", 500),
-    valued("--axis", "N", integer(1), "output that moves", 1),
+    take_value("--taps", "N", integer(1, 9), "of the shaper at most; 1: none", 3),
+    take_value("--judges", "N", integer(1), "plants of the set that judge the design", 500),
+    take_value("--axis", "N", integer(1), "output that moves", 1),
     *MOVE_OPTIONS, needs=["ccd_casadi.extensions.feedforward.set_feedforward"], place=RUN,
     without_effect=["--workers"],
 )  # fmt: skip
@@ -95,10 +95,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform("\n".join(summary(found)))
     publish(run.folder, folder / "report.html", feedforward_page(run, found, index_of(folder)))
     inform(f"page          {folder / 'report.html'}")
-    return _ended(found)
+    return _end(found)
 
 
-def _ended(found: "SetFeedforward") -> ExitCode:
+def _end(found: "SetFeedforward") -> ExitCode:
     if found.kept == len(found.judged):
         return ExitCode.DONE
     lost = len(found.judged) - found.kept

@@ -12,7 +12,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.realisation import literals
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREY
-from ccd_casadi.extensions.feedforward.move_responses import (
+from ccd_casadi.extensions.feedforward.coefficients import (
     MoveResponses,
     Shape,
     learn,

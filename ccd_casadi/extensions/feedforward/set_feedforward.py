@@ -16,17 +16,15 @@ from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.robust_set import members
-from ccd_casadi.extensions.feedforward.least_time import (
+from ccd_casadi.extensions.feedforward.coefficients import (
     ForceLimits,
     LeastTime,
     LeastTimeOptions,
-    least_time,
-)
-from ccd_casadi.extensions.feedforward.move_responses import (
     MoveResponses,
     Shape,
     contraction,
     learning_gain,
+    least_time,
     responses_of,
 )
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -122,7 +120,7 @@ def set_feedforward(
         responses, _shapes(run, one, taps, samples, options), x, window, limits, latest, options
     )
     for i in range(options.rounds):
-        more = respond(_drawn(run, options.drawn, [seed, 1 + i]), samples=samples)
+        more = respond(_draw_plants(run, options.drawn, [seed, 1 + i]), samples=samples)
         times = np.array(
             [one.with_taps(found.shape).settling_time(found.x, window) for one in more]
         )
@@ -132,7 +130,7 @@ def set_feedforward(
             break
         responses += [more[i] for i in worst]
         found = _best(responses, [found.shape], x, window, limits, length, options)
-    judges = respond(_drawn(run, options.judges, [seed, 0]), samples=samples)
+    judges = respond(_draw_plants(run, options.judges, [seed, 0]), samples=samples)
 
     def times_of(some: Sequence[MoveResponses], shape: Shape, x: Array) -> Array:
         return np.array([each.with_taps(shape).settling_time(x, window) for each in some])
@@ -175,10 +173,10 @@ def _responses(
             for plant in plants]  # fmt: skip
 
 
-def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+def _draw_plants(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     """Plants from the box of a run; none where it has none."""
     if not kind_of(run.problem).as_designed:
-        return _drawn_shifts(run, count, seed)
+        return _draw_shifted(run, count, seed)
     uncertain = uncertain_plant(run.problem, run.theta)
     if not uncertain.names and len(uncertain.options) == 1:
         return []
@@ -186,7 +184,7 @@ def _drawn(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     return [plant.plant_si() for plant in uncertain.plants(points)]
 
 
-def _drawn_shifts(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
+def _draw_shifted(run: FinishedRun, count: int, seed: list[int]) -> list[StateSpace]:
     """Plants from the ranges of resonances and damping of a full-order run."""
     robust, rng = run.problem.robust, np.random.default_rng(seed)
     if robust is None:

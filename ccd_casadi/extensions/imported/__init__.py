@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, option, valued
+from ccd_casadi.support.options import integer, option, take_value
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:
@@ -34,7 +34,11 @@ EXTENSION = Extension(
 
 
 def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
-    from ccd_casadi.extensions.imported.matrices import read_index, reduced_table, results_table
+    from ccd_casadi.extensions.imported.sampled_plant import (
+        read_index,
+        reduced_table,
+        results_table,
+    )
 
     columns = next(iter(read_index(folder).values()))
     if "results" in columns:
@@ -48,9 +52,9 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
 @command(
     "ccd_casadi.imported",
     "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
-    valued("--modes", "N", integer(1), "modes of matrices", 10),
+    take_value("--modes", "N", integer(1), "modes of matrices", 10),
     option("--static-correction", action="store_true", help="exact static compliance of matrices"),
-    needs=["ccd_casadi.extensions.imported.matrices"],
+    needs=["ccd_casadi.extensions.imported.sampled_plant"],
     place=RUN | {"metavar": "FOLDER", "help": "the folder with index.csv and dofs.csv"},
     without_effect=["--workers", "--seed", "--no-user-code"],
 )  # fmt: skip

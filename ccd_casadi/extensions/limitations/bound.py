@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ccd_casadi.extensions.limitations.limits import Limits, discs
 from ccd_casadi.extensions.limitations.multiplier import (
+    Limits,
     MultiplierBasis,
+    discs,
     greatest_multiplier,
     least_scaling,
 )

@@ -15,7 +15,7 @@ from ccd_casadi.extensions.limitations.bound import (
     pointwise,
     upper_bound,
 )
-from ccd_casadi.extensions.limitations.limits import Limits, limits_of
+from ccd_casadi.extensions.limitations.multiplier import Limits, response_of
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -23,13 +23,53 @@ from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, structured_of
-from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import HZ, number
+
+
+def limits_of(
+    plant: StateSpace,
+    bounds: Bounds,
+    sampling: Sampling | None,
+    name: str = "",
+    direction: Array | None = None,
+    ratio: float = 1.0,
+    integrator: bool = True,
+    outside: float = 1e-3,
+) -> Limits:
+    """Find the limits of a SI plant in a direction of outputs (one output: None).
+
+    `bounds` are its own. Free bodies and unstable poles make S vanish there; what is used here, T
+    analytic with zeros of G, holds with them too. A root whose real part is `outside` of its size
+    counts as one of the right half plane.
+    """
+    if sampling is None:
+        held, period = plant, 0.0
+    else:
+        held, period = zoh(plant, sampling.period, sampling.delay), sampling.period
+    u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
+    parts = (
+        response_of(
+            StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period)
+        )
+        for j in range(held.B.shape[1])
+    )
+    row = tuple(part for part in parts if part is not None)
+    one = plant.B.shape[1] == 1 and len(plant.C) == 1
+    roots = (row[0].zeros, row[0].poles) if one else (np.empty(0, complex),) * 2
+    beyond, growing = (tuple(part[part.real > outside * np.abs(part)].tolist()) for part in roots)
+    free = None
+    forced = getattr(plant, "mechanics", plant)  # on which disturbing forces act
+    alone = forced.B.shape[1] == len(forced.C) == 1  # what they move is S times it
+    if one and alone and bounds.compliance_max is not None:
+        free = response_of(forced)
+    return Limits(name, bounds, row, free, period, beyond, ratio, integrator, unstable=growing)
+
 
 MODEL = "the model"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, one_line, option, positive, real, valued
+from ccd_casadi.support.options import integer, one_line, option, positive, real, take_value
 from ccd_casadi.support.terminal import inform, say
 
 EXTENSION = Extension(
@@ -30,11 +30,11 @@ EXTENSION = Extension(
     "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
     option("--rate-hz", metavar="X", type=positive,
            help="sampling rate; responses include the hold"),
-    valued("--delay", "SECONDS", real(), "delay in s besides that in DATA", 0.0),
-    valued("--s-max", "X", real(1.0, strict=True), "bound of |S|", 1.8),
-    valued("--shape", "X", real(1.0), "bound of |S| over ω/(√2 ω_b)", 1.1),
-    valued("--effort", "X", positive, "bound of |KS| over 1/|G| about ω_b", 20.0),
-    valued("--lead", "N", integer(0), "number of leads, with --biquads", 1),
+    take_value("--delay", "SECONDS", real(), "delay in s besides that in DATA", 0.0),
+    take_value("--s-max", "X", real(1.0, strict=True), "bound of |S|", 1.8),
+    take_value("--shape", "X", real(1.0), "bound of |S| over ω/(√2 ω_b)", 1.1),
+    take_value("--effort", "X", positive, "bound of |KS| over 1/|G| about ω_b", 20.0),
+    take_value("--lead", "N", integer(0), "number of leads, with --biquads", 1),
     option("--biquads", metavar="N", type=integer(0),
            help="number of notches (default: by the resonances)"),
     option("--unstable-poles", metavar="N", type=integer(0),
@@ -43,7 +43,8 @@ EXTENSION = Extension(
            help="of a measured plant (default: by the slope of the first lines)"),
     option("--least-damping", metavar="X", type=positive,
            help="damping ratio of a resonance that lines may hide, at least (default: 0.0005)"),
-    valued("--spread", "X", real(), "factor on the spread of DATA within which bounds hold", 1.0),
+    take_value("--spread", "X", real(), "factor on the spread of DATA within which bounds hold",
+               1.0),
     option("--controller", metavar="FILE", type=Path,
            help="the present controller (.json, .toml, .mat), judged beside the new one"),
     option("--rotary", action="store_true", help="the plant's output is in rad, its input in N m"),

@@ -20,8 +20,7 @@ from ccd_casadi.support.json_files import mat_variables
 from ccd_casadi.support.terminal import Log
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
-from ccd_casadi.synthesis.matlab_systems import bare
-from ccd_casadi.synthesis.time_base import HINT, appears_discrete
+from ccd_casadi.synthesis.matlab_systems import HINT, appears_discrete, bare
 
 Plant = MeasuredResponse | StateSpace
 

@@ -4,8 +4,9 @@ A model becomes lines, hold and delay exact, and is designed on as a measured re
 end it is a model again: the poles of the sampled loop and ‖S‖∞ by a Hamiltonian matrix decide.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_fla
 from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
+from ccd_casadi.plants.measured import MeasuredResponse
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Log, silent
@@ -156,87 +159,149 @@ def tune(
     """
     use_units(*(("rad", "N m") if rotary else ("m", "N")))
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
-    if not given:
-        raise UserError("there is no plant to tune for; give one")
-    if not 1.0 < S_max < np.inf:
-        raise UserError(f"S_max: is {S_max:.6g}; no loop has less than 1, so give more")
-    if not 1.0 <= shape < np.inf:
-        raise UserError(f"shape: is {shape:.6g}; give 1 or more")
-    for key, value in (("rate_hz", rate_hz), ("effort", effort)):
-        if value is not None and not 0.0 < value < np.inf:
-            raise UserError(f"{key}: is {value:.6g}; give a number above 0")
+    _require_numbers(given, S_max, shape, {"rate_hz": rate_hz, "effort": effort})
     log = progress or silent
-    own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
-           "least_damping": least_damping}  # fmt: skip
-    stated = [name for name, value in own.items() if value is not None]
-    known = [read_plant(item, delay, log) for item in given]
-    if stated and all(isinstance(item, StateSpace) for item, _ in known):
-        words = f"{', '.join(stated)}: is of measured plants, and of a model its poles are known"
-        raise UserError(f"{words}; drop it")
-    known = [
-        (item if isinstance(item, StateSpace) else replace(
-            item, unstable_poles=unstable_poles or item.unstable_poles,
-            poles_at_zero=item.poles_at_zero if poles_at_zero is None else poles_at_zero,
-            least_damping=least_damping or item.least_damping,
-            spread=None if item.spread is None or not spread else spread * item.spread), late)
-        for item, late in known
-    ]  # fmt: skip
+    stated = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
+              "least_damping": least_damping}  # fmt: skip
+    known = _read_plants(given, delay, stated, spread, log)
     names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
-    read = []
-    for i, ((item, late), name) in enumerate(zip(known, names, strict=True), 1):
-        try:
-            read.append(as_lines(item, rate_hz, late))
-        except UserError as error:
-            raise UserError(f"{name or f'plant {i}'}: {error}" if known[1:] else error) from None
-    responses = tuple(one for one, _ in read)
-    models = tuple(model for _, model in read)
+    responses, models = _place_on_lines(known, names, rate_hz)
     if structure is None:
         biquads = min(options.most_notches, len(responses[0].resonances))
         structure = Structure(biquads=biquads, least_damping=0.1)
     periods = [model.period for model in models if model is not None]
     period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
     bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
-    name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
-    inside, initial = options.inside * (S_max - 1.0) if periods else 0.0, None
+    search = partial(
+        design_on_data, structure=structure, period=period, seed=seed, effort=effort,
+        given_up=options.given_up, progress=log, workers=workers,
+    )  # fmt: skip
+    inside = options.inside * (S_max - 1.0) if periods else 0.0
+    trial = _Trial(responses, inside, starts)
     for _ in range(options.rounds):
-        aim = replace(bounds, S_max=S_max - inside)
-        design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
-                                effort=effort, given_up=options.given_up, initial=initial,
-                                progress=log, workers=workers)  # fmt: skip
-        if not periods:
-            break
+        design = trial.design(search, bounds)
         loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
+        following = trial.follow(design, models, loops, S_max, options)
+        if following is None:
+            break
+        trial = following
+    norms: tuple[float | None, ...] = tuple(None for _ in models)
+    if periods and design.controller is not None:
+        design = _on_models(design, loops, S_max)
+        norms = tuple(None if loop is None else loop.norm for loop in loops)
+    name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
+    case = MeasuredCase(Path(name), name, trial.responses, structure, bounds, period, trial.starts)
+    design, judge = _confirm(design, known, case)
+    return Tuned(case, design, models, norms, judge)
+
+
+def _require_numbers(
+    given: Sequence[Any], S_max: float, shape: float, positive: Mapping[str, float | None]
+) -> None:
+    """Raise UserError where an argument has no meaning."""
+    if not given:
+        raise UserError("there is no plant to tune for; give one")
+    if not 1.0 < S_max < np.inf:
+        raise UserError(f"S_max: is {S_max:.6g}; no loop has less than 1, so give more")
+    if not 1.0 <= shape < np.inf:
+        raise UserError(f"shape: is {shape:.6g}; give 1 or more")
+    for key, value in positive.items():
+        if value is not None and not 0.0 < value < np.inf:
+            raise UserError(f"{key}: is {value:.6g}; give a number above 0")
+
+
+def _read_plants(
+    given: Sequence[Any], delay: float, stated: Mapping[str, Any], spread: float, log: Log
+) -> list[tuple[Plant, float]]:
+    """Read each plant and its delay in s, with what is stated of the measured ones."""
+    known = [read_plant(item, delay, log) for item in given]
+    names = [name for name, value in stated.items() if value is not None]
+    if names and all(isinstance(item, StateSpace) for item, _ in known):
+        words = f"{', '.join(names)}: is of measured plants, and of a model its poles are known"
+        raise UserError(f"{words}; drop it")
+
+    def complete(item: Plant) -> Plant:
+        if isinstance(item, StateSpace):
+            return item
+        at_zero = stated["poles_at_zero"]
+        return replace(
+            item, unstable_poles=stated["unstable_poles"] or item.unstable_poles,
+            poles_at_zero=item.poles_at_zero if at_zero is None else at_zero,
+            least_damping=stated["least_damping"] or item.least_damping,
+            spread=None if item.spread is None or not spread else spread * item.spread,
+        )  # fmt: skip
+
+    return [(complete(item), late) for item, late in known]
+
+
+def _place_on_lines(
+    known: Sequence[tuple[Plant, float]], names: Sequence[str], rate_hz: float | None
+) -> tuple[tuple[MeasuredResponse, ...], tuple[StateSpace | None, ...]]:
+    """Find each plant's lines, and its model in discrete time where it is one."""
+    read = []
+    for i, ((item, late), name) in enumerate(zip(known, names, strict=True), 1):
+        try:
+            read.append(as_lines(item, rate_hz, late))
+        except UserError as error:
+            raise UserError(f"{name or f'plant {i}'}: {error}" if known[1:] else error) from None
+    return tuple(one for one, _ in read), tuple(model for _, model in read)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What a design on lines is searched with: `inside`, by how much S_max is less there, and where
+    the search starts, None: from `starts` alone."""
+
+    responses: tuple[MeasuredResponse, ...]
+    inside: float
+    starts: int
+    initial: Array | None = None
+
+    def design(self, search: Callable[..., MeasuredDesign], bounds: Bounds) -> MeasuredDesign:
+        """Search the design on the lines."""
+        aim = replace(bounds, S_max=bounds.S_max - self.inside)
+        return search(self.responses, bounds=aim, starts=self.starts, initial=self.initial)
+
+    def follow(
+        self, design: MeasuredDesign, models: Sequence[StateSpace | None],
+        loops: "Sequence[LoopOnModel | None]", S_max: float, options: TuningOptions,
+    ) -> "_Trial | None":  # fmt: skip
+        """Find the next trial; None where the design is as good on the models as on their lines."""
         found = [loop for loop in loops if loop is not None]
         worse = [loop for loop in found if not loop.norm <= S_max]
         least = (1.0 - options.slower) * design.bandwidth
         slower = [loop for loop in found if loop.bandwidth < least]
-        if design.usable and not worse and not slower:
-            break
-        # A local search that ends outside its bounds is begun anew, with more starts.
-        initial = design.kappa if design.usable else None
-        inside *= 2.0 if design.usable and worse else 1.0
-        starts = starts if design.usable else min(2 * starts, max(starts, options.most_starts))
+        if all(G is None for G in models) or (design.usable and not worse and not slower):
+            return None
         near = [place for loop in worse for place in loop.peaks]
         near += [place for loop in slower for place in loop.limits]
         responses = tuple(one if G is None else with_lines_near(one, G, near)
-                          for one, G in zip(responses, models, strict=True))  # fmt: skip
-    norms: tuple[float | None, ...] = tuple(None for _ in models)
-    if periods and design.controller is not None:
-        loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
-        design = _on_models(design, loops, S_max)
-        norms = tuple(None if loop is None else loop.norm for loop in loops)
-    case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
-    judge, K = NOT_JUDGED, design.controller
-    if design.usable and K is not None:
-        coded = K if period is None else realise_blocks(tustin(K, period)).as_coded
-        judge = judgement.together([
-            judgement.attempt_judgement(_judge, plant, late, K, coded, bounds, design.bandwidth,
-                                structure.integrator)
-            for plant, late in known
-        ])  # fmt: skip
-        words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
-        design = design if judge.passed else replace(design, usable=False, words=words)
-    return Tuned(case, design, models, norms, judge)
+                          for one, G in zip(self.responses, models, strict=True))  # fmt: skip
+        if design.usable:
+            return _Trial(responses, (2.0 if worse else 1.0) * self.inside, self.starts,
+                          design.kappa)  # fmt: skip
+        # A local search that ends outside its bounds is begun anew, with more starts.
+        more = min(2 * self.starts, max(self.starts, options.most_starts))
+        return _Trial(responses, self.inside, more)
+
+
+def _confirm(
+    design: MeasuredDesign, known: Sequence[tuple[Plant, float]], case: MeasuredCase
+) -> tuple[MeasuredDesign, Judgement]:
+    """Judge a usable design on the plants as they were given, which may refute that it is."""
+    K = design.controller
+    if not design.usable or K is None:
+        return design, NOT_JUDGED
+    coded = K if case.period is None else realise_blocks(tustin(K, case.period)).as_coded
+    judge = judgement.together([
+        judgement.attempt_judgement(_judge, plant, late, K, coded, case.bounds, design.bandwidth,
+                                    case.structure.integrator)
+        for plant, late in known
+    ])  # fmt: skip
+    if judge.passed:
+        return design, judge
+    words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
+    return replace(design, usable=False, words=words), judge
 
 
 def _judge(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import option, positive, real, valued
+from ccd_casadi.support.options import option, positive, real, take_value
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ EXTENSION = Extension(
     option("--add-injected", action="store_true",
            help="the column of the force has the controller's alone, without what is injected"),
     option("--rate-hz", metavar="X", type=positive, help="sampling rate, without a time column"),
-    valued("--confidence", "X", real(0.5, 0.9999), "of the spread, at each line", 0.95),
-    valued("--gain", "X", positive, "factor on the response, where units are not m and N", 1.0),
+    take_value("--confidence", "X", real(0.5, 0.9999), "of the spread, at each line", 0.95),
+    take_value("--gain", "X", positive, "factor on the response, where units are not m and N", 1.0),
     option("--rotary", action="store_true", help="the position is in rad, the force in N m"),
     needs=["ccd_casadi.extensions.records.plant_estimate",
            "ccd_casadi.extensions.records.record_findings"],

@@ -1,17 +1,17 @@
-"""Columns of a log by name, as numbers over samples: text, binary files, LabVIEW, TwinCAT.
+"""Columns of a log by name, with units, as numbers over samples: text, binary, LabVIEW, TwinCAT.
 
 .tdms is read by npTDMS: every channel of one length and one sampling time. The text export of a
 TwinCAT scope has groups of channels, each behind its time in ms.
 """
 
 import logging
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.extensions.records.signal_names import unit_factor
 from ccd_casadi.plants.table_columns import npz_arrays, texts_of
 from ccd_casadi.support.errors import UserError, describe, require
 from ccd_casadi.support.json_files import mat_variables
@@ -23,6 +23,53 @@ from ccd_casadi.support.text_table import (
     separator,
     text_of,
 )
+
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "force": {"n": 1.0, "mn": 1e-3, "kn": 1e3, "n m": 1.0, "nm": 1.0, "n*m": 1.0, "v": 1.0},
+    "position": {
+        "m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0, "mrad": 1e-3,
+        "urad": 1e-6, "µrad": 1e-6,
+    },
+}  # fmt: skip
+
+
+def unit_factor(text: str) -> float | None:
+    """Find the factor of a cell that holds a unit alone; None where it is not a unit.
+
+    >>> unit_factor("[ms]"), unit_factor("speed")
+    (0.001, None)
+    """
+    plain = _plain(text.strip("[]() "))
+    if plain in ("", "-", "1"):
+        return 1.0
+    return next((units[plain] for units in UNITS.values() if plain in units), None)
+
+
+def _plain(text: str) -> str:
+    micro = text.replace("\N{GREEK SMALL LETTER MU}", "µ")
+    return " ".join(micro.replace("_", " ").split()).casefold()
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Part the name of a column from its unit, both in small letters; "" where there is no unit.
+
+    >>> parts = "Position [mm]", "force_command", "pos_um", "ActPosUm[0]"
+    >>> tuple(map(split_unit, parts))
+    (('position', 'mm'), ('force command', ''), ('pos', 'um'), ('actpos', 'um'))
+    """
+    name = re.sub(r"\[\d+\]$", "", name.strip())  # the number of an axis
+    camel = re.fullmatch(r"(\w*[a-z])(Um|Mm|Mrad|Urad|N)", name)
+    if camel:
+        return _plain(camel[1]), _plain(camel[2])
+    plain = _plain(name)
+    bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", plain)
+    if bracket:
+        return bracket[1], bracket[2]
+    base, _, last = plain.rpartition(" ")
+    if base and any(last in units for units in UNITS.values()):
+        return base, last
+    return plain, ""
 
 
 class _Kept(logging.Handler):

@@ -1,14 +1,69 @@
-"""Records of a loop: excitation, force and position over time, read from files of logs."""
+"""Records of a loop: excitation, force and position over time, found by the names of columns."""
 
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.extensions.records.log_files import Columns, read_columns
-from ccd_casadi.extensions.records.signal_names import REFERENCES, column_of, factor_of, split_unit
+from ccd_casadi.extensions.records.log_files import UNITS, Columns, read_columns, split_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+
+ROLES: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "timestamp", "seconds"),
+    "excitation": (
+        "injected", "injection", "inject", "excitation", "excitation force", "disturbance", "noise",
+        "reference", "ref", "setpoint", "r", "noiseout", "sweep", "chirp",
+    ),
+    "force": (
+        "force", "force command", "command", "control", "u", "torque", "torque command", "thrust",
+        "servoout", "controller output", "input", "voltage",
+    ),
+    "position": (
+        "position", "pos", "y", "displacement", "encoder", "actual position", "actpos", "angle",
+        "output", "x",
+    ),
+}  # fmt: skip
+OPTIONS = {"time": "--time", "excitation": "--injected or --reference", "force": "--force",
+           "position": "--position"}  # fmt: skip
+REFERENCES = ("reference", "ref", "setpoint")
+SI = {"time": "s", "force": "N", "position": "m"}
+
+
+def column_of(path: Path, role: str, names: Iterable[str], stated: str | None) -> str | None:
+    """Find the column of a role of ROLES among all names; None where no column has a name of it.
+
+    `stated` is by an option. Raises UserError where that column is not there, or two may be meant.
+    """
+    names = list(names)
+    if stated is not None:
+        exact = [name for name in names if stated in (name, split_unit(name)[0])]
+        if len(exact) != 1:
+            words = "is there more than once" if exact else "is not there"
+            raise UserError(f"{path}: column {stated!r} {words}; it has {', '.join(names)}")
+        return exact[0]
+    found = [name for name in names if split_unit(name)[0] in ROLES[role]]
+    if len(found) > 1:
+        both = " or ".join(repr(name) for name in found)
+        raise UserError(f"{path}: the {role} may be {both}; state which with {OPTIONS[role]}")
+    return found[0] if found else None
+
+
+def factor_of(path: Path, role: str, name: str) -> tuple[float, str]:
+    """Find the factor of a column to SI by the unit in its name, and that unit in words, such as
+    "m, as no unit is named". Raises UserError where it is not a unit of the role.
+    """
+    unit = split_unit(name)[1]
+    if unit in ("", "-", "1"):
+        return 1.0, f"{SI[role]}, as no unit is named"
+    known = UNITS[role]
+    if unit not in known:
+        raise UserError(f"{path}: {name!r}: the unit {unit!r} is not one of a {role}; it may be "
+                        f"{', '.join(known)}")  # fmt: skip
+    written = re.search(re.escape(unit), name, re.IGNORECASE)
+    return known[unit], written[0] if written else unit
 
 
 @dataclass(frozen=True)

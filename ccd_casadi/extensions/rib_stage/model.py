@@ -127,7 +127,7 @@ def solve_modes(
             wanted[group] = number
     boxes = disc.assembler.box_matrices(theta, stage_modes.StageModeOptions.shift)
 
-    def solved(group: stage_modes.Group) -> stage_modes.GroupModes:
+    def solve(group: stage_modes.Group) -> stage_modes.GroupModes:
         keep = wanted[group] + fading
         found = stage_modes.spectrum(
             disc, geometry, theta, group, keep + stage_modes.StageModeOptions.extra, boxes
@@ -135,7 +135,7 @@ def solve_modes(
         return stage_modes.group_modes(disc, geometry, found, keep + bool(fading), points)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
-    found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
+    found = dict(zip(largest_first, side_by_side(solve, largest_first), strict=True))
     spectra = tuple(found[group] for group in wanted)
     flexible = [
         _mode(item, index, place, image)

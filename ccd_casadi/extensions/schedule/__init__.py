@@ -10,7 +10,7 @@ from functools import partial
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.extensions import Extension
-from ccd_casadi.support.options import integer, one_line, option, real, valued
+from ccd_casadi.support.options import integer, one_line, option, real, take_value
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.terminal import inform, remark, say
 
@@ -29,10 +29,10 @@ EXTENSION = Extension(
     "Design a controller for each part of the range of a measured parameter.",
     option("--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"),
     option("--by", metavar="NAME", help="the parameter, where several vary"),
-    valued("--share", "X", real(0.1, 1.0),
+    take_value("--share", "X", real(0.1, 1.0),
            "of the bandwidth that a position has alone, which its part has at least", 0.9),
-    valued("--parts", "N", integer(1, 64), "at most", 8),
-    valued("--positions", "N", integer(2), "at which the schedule is judged", 1001),
+    take_value("--parts", "N", integer(1, 64), "at most", 8),
+    take_value("--positions", "N", integer(2), "at which the schedule is judged", 1001),
     needs=["ccd_casadi.extensions.schedule.schedule_files", "ccd_casadi.codesign.result"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
@@ -41,12 +41,11 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.plant_tables import parse_theta
     from ccd_casadi.drawing.paint import write_page
-    from ccd_casadi.extensions.schedule.handover import cross, rates_tried, way_of
-    from ccd_casadi.extensions.schedule.rate_bound import rate_bound_of
+    from ccd_casadi.extensions.schedule.handover import cross, rate_bound_of, rates_tried, way_of
     from ccd_casadi.extensions.schedule.schedule_files import (
         Schedule,
         entry,
-        kept_at_positions,
+        keep_at_positions,
         schedule_page,
         summary,
         write_code,
@@ -77,7 +76,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         parts, alone, whole = segments_of(
             problem, theta, name, log=log, workers=workers, options=limits
         )
-        parts, frozen = kept_at_positions(
+        parts, frozen = keep_at_positions(
             problem, theta, name, parts, options.positions, workers=workers, log=log
         )
         segments = judge_parts(parts, theta, workers=workers, log=log, options=limits)

@@ -14,11 +14,11 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.extensions.schedule.handover import (
     CrossingOptions,
+    RateBound,
     RateTrial,
     controllers_of,
     handovers,
 )
-from ccd_casadi.extensions.schedule.rate_bound import RateBound
 from ccd_casadi.extensions.schedule.segments import (
     Alone,
     DesignedPart,
@@ -143,7 +143,7 @@ def frozen_positions(
     return found
 
 
-def kept_at_positions(
+def keep_at_positions(
     problem: CoDesignProblem, theta: Sequence[float], name: str, parts: Sequence[DesignedPart],
     count: int, *, workers: Pool, log: Log = silent,
     options: ScheduleOptions = ScheduleOptions(),
@@ -216,7 +216,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
     """Write schedule.h and schedule.c."""
     K = controllers_of(found.segments, sampling)
 
-    def joined(parts: Sequence[Array]) -> str:
+    def join(parts: Sequence[Array]) -> str:
         return literals(np.concatenate([part.ravel() for part in parts]), 4)
 
     values: Mapping[str, Any] = {
@@ -228,7 +228,7 @@ def write_code(folder: Path, found: Schedule, sampling: Sampling) -> None:
         "n": len(K[0].A), "p": K[0].B.shape[1], "m": len(K[0].C),
         "low": literals(np.array([one.low for one in found.segments]), 4),
         "high": literals(np.array([one.high for one in found.segments]), 4),
-        **{part: joined([getattr(one, part) for one in K]) for part in "ABCD"},
+        **{part: join([getattr(one, part) for one in K]) for part in "ABCD"},
         "T": literals(handovers(K), 4),
     }  # fmt: skip
     for name in CODE:

@@ -102,14 +102,14 @@ class Plan:
         """Fresh draws of the certificate."""
         return ceil(self.options.enough * log1p(-self.confidence) / log(self.share))
 
-    def shown_share(self, failed: int) -> float:
+    def bound_share(self, failed: int) -> float:
         """The share of all machines that is shown to keep the bounds if `failed` draws do not."""
         return yield_bound(self.draws - failed, self.draws, self.confidence)
 
     @cached_property
     def allowed(self) -> int:
         """The most of the certificate's draws that may fail."""
-        return next(m for m in count() if self.shown_share(m + 1) < self.share)
+        return next(m for m in count() if self.bound_share(m + 1) < self.share)
 
     @cached_property
     def trial(self) -> Trial:
@@ -158,7 +158,7 @@ class ShareCertificate:
     @property
     def least(self) -> float:
         """The share of all machines that is shown, at the confidence."""
-        return self.plan.shown_share(self.failed)
+        return self.plan.bound_share(self.failed)
 
     @property
     def passed(self) -> bool:

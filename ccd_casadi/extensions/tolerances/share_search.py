@@ -267,7 +267,7 @@ def search_share(
     trial = search.plan.trial
     short = Trial(1, -(-trial.allowed // trial.rounds))
 
-    def screened(one: ShareSearch) -> ShareSearch:
+    def screen(one: ShareSearch) -> ShareSearch:
         return one.at_its_theta(log, options, short, options.rounds)
 
     J = partial(objective_of, search.problem)
@@ -277,11 +277,11 @@ def search_share(
         both."""
         if not J(best) < J(search.best) - options.settled * abs(J(search.best)):
             return search
-        there = screened(replace(search, best=best))
+        there = screen(replace(search, best=best))
         here = replace(search, tail=there.tail, rounds=there.rounds).redesign(log, options)
         return min((here, there), key=lambda one: J(one.best))
 
-    search = screened(search)
+    search = screen(search)
     elsewhere = multistart_at(search.sampler, search.best).design.kappa.tolist()
     search = better(search.sampler.value_from(search.best.theta, elsewhere))
     for _ in range(options.moves if moves else 0):
