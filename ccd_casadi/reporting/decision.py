@@ -19,6 +19,7 @@ from ccd_casadi.reporting.concerns import (
     limited_move_remedy,
     lines_of,
     loop_concerns,
+    open_bound,
     resonance_condition,
     why_unproven,
 )
@@ -191,7 +192,8 @@ def decide(result: Mapping[str, Any]) -> Decision:
         ConcernKind.BUDGET: "budget",
     }
     present = {one.reason for one in concerns}
-    steps = tuple(dict.fromkeys(NEXT[name] for why, name in remedies.items() if why in present))
+    next_ = NEXT | {"unproven": open_bound(result).remedy or NEXT["unproven"]}
+    steps = tuple(dict.fromkeys(next_[name] for why, name in remedies.items() if why in present))
     return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition)
 
 
@@ -240,8 +242,8 @@ def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Con
     own = result["verdict"].get("survives", {}).get("set")
     if state == State.WARNED:
         if own == OwnSet.UNPROVEN:
-            words = "the bounds are not proven on the whole [robust] set"
-            return [Concern(ConcernKind.SET_UNPROVEN, words)]
+            open_ = "the bounds are not proven on the whole [robust] set"
+            return [Concern(ConcernKind.SET_UNPROVEN, open_bound(result).words or open_)]
         if own == OwnSet.KEPT and (doubt := _unstable_controller(result)):
             return [Concern(ConcernKind.UNSTABLE_CONTROLLER, doubt)]
         if own == OwnSet.NONE:
