@@ -42,7 +42,7 @@ from ccd_casadi.synthesis.weights import Weights
 if TYPE_CHECKING:
     from ccd_casadi.budget.sources import ErrorBudget
 
-NUMERICS = 14  # raised whenever a change of ours moves the numbers that a sample holds
+NUMERICS = 15  # raised whenever a change of ours moves the numbers that a sample holds
 
 
 @dataclass(frozen=True)
