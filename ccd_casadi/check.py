@@ -5,7 +5,7 @@ import sys
 
 from ccd_casadi.support.command_line import ExitCode, command, option, program, run_folder
 from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.text import plural
+from ccd_casadi.support.text import plural, spoken, with_unit
 
 
 @command(
@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if options.json:
         say(json_text(found))
     else:
-        words = template("templates/check.txt", counted=plural)
+        words = template("templates/check.txt", counted=plural, spoken=spoken, with_unit=with_unit)
         say(
             words.render(found, start=theta_words(found), shares=PlantReportOptions.shares).rstrip()
         )

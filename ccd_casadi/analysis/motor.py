@@ -121,9 +121,9 @@ class Cycle:
 def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | None = None) -> Cycle:
     """Compute the cycle of a motion within what its motor allows.
 
-    Of free bodies F = g r̈. Where springs or magnets hold the output, F = h r + g r̈: the cycle
-    leads from the place without force, r = 0, to `distance`, and back after a dwell. The way back
-    has the forces of the way there in reverse order, since r(t) + r(T - t) = `distance`.
+    Of free bodies F = g r̈. Where springs or magnets hold the output, F = h r + d ṙ + g r̈: the
+    cycle leads from the place without force, r = 0, to `distance`, and back after a dwell. The way
+    back has these forces in reverse order with -d, since r(t) + r(T - t) = `distance`.
 
     Parameters
     ----------
@@ -133,8 +133,8 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
         g per unit acceleration, kg.
     mass : float
         Moving mass of the motor, kg; complex for derivatives.
-    holding : (m,) array, optional
-        h per unit of the position, N/m.
+    holding : (2, m) array, optional
+        h and d per unit of the position and its velocity, N/m and N s/m.
 
     Returns
     -------
@@ -172,17 +172,19 @@ def _compute_held(
     motion: Motion, forces: Array, mass: Any, holding: Array,
     options: MotionOptions = MotionOptions(),
 ) -> Cycle:  # fmt: skip
-    """Compute the cycle of an output that is held with h per unit of the position."""
+    """Compute the cycle of an output that is held with h and d per unit of position and velocity."""
     free = replace(motion, motor=None)
     found = cycle_of(free, forces)
     profile, far = found.profile, motion.limits.stroke
     x, weights = np.polynomial.legendre.leggauss(options.nodes)
-    r, _, a, *_ = profile.inside(0.5 * (1.0 + x))
-    squares = (holding[:, None, None] * r + forces[:, None, None] * a) ** 2
+    r, v, a, *_ = profile.inside(0.5 * (1.0 + x))
+    h, d, g = (each[:, None, None] for each in (*holding, forces))
+    squares = (h * r + g * a) ** 2 + (d * v) ** 2  # what else d adds there it takes on the way back
     there = (squares @ (0.5 * weights)) @ profile.durations
-    rest = 0.5 * motion.dwell * (holding * far) ** 2  # at `distance`: every second dwell
+    rest = 0.5 * motion.dwell * (holding[0] * far) ** 2  # at `distance`: every second dwell
     mean = (there + rest) / (profile.durations.sum() + motion.dwell)
-    peaks = [_peak(profile, h, g, far, options) for h, g in zip(holding, forces, strict=True)]
+    peaks = [_peak(profile, h, way * d, g, far, options)
+             for h, d, g in zip(*holding, forces, strict=True) for way in (1.0, -1.0)]  # fmt: skip
     found = replace(found, peak_force=_largest(np.array(peaks)),
                     rms_force=_largest(mean) ** 0.5)  # fmt: skip
     if motion.motor is None:
@@ -193,17 +195,19 @@ def _compute_held(
                    heat_share=power / (motion.motor.rms_power or np.inf))  # fmt: skip
 
 
-def _peak(profile: Setpoint, h: Any, g: Any, far: float, options: MotionOptions) -> Any:
-    """Find the largest |h r + g r̈| of a move, or |h| `far` at rest, by Newton's step to f' = 0."""
+def _peak(profile: Setpoint, h: Any, d: Any, g: Any, far: float, options: MotionOptions) -> Any:
+    """Find the largest |h r + d ṙ + g r̈| of a move, or |h| `far` at rest, by Newton's step to
+    f' = 0."""
     shares = np.linspace(0.0, 1.0, options.shares)
     r, v, a, j, s = profile.inside(shares).real
-    f, slope, bend = (np.real(h) * x + np.real(g) * y for x, y in ((r, a), (v, j), (a, s)))
+    h_, d_, g_ = np.real([h, d, g])
+    f, slope, bend = (h_ * x + d_ * y + g_ * z for x, y, z in ((r, v, a), (v, a, j), (a, j, s)))
     size = np.maximum(profile.durations.real, 1e-300)[:, None]
     far_off = np.abs(slope) >= shares[1] * np.abs(bend) * size  # a step beyond the next instant
     step = np.divide(-slope, bend * size, out=np.zeros_like(f), where=~far_off)
     near = np.clip(shares + step, 0.0, 1.0)
-    r, _, a, *_ = profile.inside(near)
-    found = np.append((h * r + g * a).ravel(), h * far)
+    r, v, a, *_ = profile.inside(near)
+    found = np.append((h * r + d * v + g * a).ravel(), h * far)
     return found[np.abs(np.real(found)).argmax()]
 
 
@@ -258,9 +262,9 @@ class MotionAt:
         Its cycle, and those with each parameter a step along the imaginary axis away.
     forward, forward_slopes : (5, m), (n_θ, 5, m) array
         Feedforward per derivative of the setpoint, and its derivatives to θ.
-    inertia, holding : (m,) array, (m,) array or None
-        g and h of the machine itself, without hold, delay, amplifiers and filters; None: nothing
-        holds the output.
+    inertia, holding : (m,) array, (2, m) array or None
+        g, and h and d, of the machine itself, without hold, delay, amplifiers and filters; None:
+        nothing holds the output.
     """
 
     motion: Motion
@@ -273,9 +277,9 @@ class MotionAt:
     holding: Array | None = None
 
     def body_forces(self, r: Array) -> Array:
-        """The forces (N, m) of a setpoint (5, N) that the cycle counts: g r̈, and h r if held."""
+        """The forces (N, m) of a setpoint (5, N) that the cycle counts: g r̈; h r + d ṙ if held."""
         forces = np.outer(r[2], self.inertia)
-        return forces if self.holding is None else forces + np.outer(r[0], self.holding)
+        return forces if self.holding is None else forces + r[:2].T @ self.holding
 
     def forward_force(self, sampling: Sampling | None) -> float:
         """The largest force of the feedforward on any motor, with all its terms.
@@ -319,12 +323,12 @@ def motion_at(
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
     ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
-    g, dg, h, dh = ahead[2], slopes[:, 2], None, slopes[:, 0]
+    g, dg, h, dh = ahead[2], slopes[:, 2], None, slopes[:, :2]
     found = cycle_of(motion, g, mass)
     if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
         body = free.mechanics or free  # what is late or filtered adds to F₂ where F₀ is not zero
         F, dF = feedforward_slopes(body.plant_si(), body.changes_si(), 0.0, 0.0)
-        g, dg, h, dh = F[2, :, 0], dF[:, 2, :, 0], F[0, :, 0], dF[:, 0, :, 0]
+        g, dg, h, dh = F[2, :, 0], dF[:, 2, :, 0], F[:2, :, 0], dF[:, :2, :, 0]
         found = cycle_of(motion, g, mass, h)
     step = 1j * options.complex_step
     stepped = tuple(

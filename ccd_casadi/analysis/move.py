@@ -351,7 +351,7 @@ def _switch(
 
 
 def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
-    """Sample r and four derivatives as a controller that holds them for a period takes them.
+    """Sample r and four derivatives as `feedforward` takes them, for a force that is held.
 
     Of each derivative the mean over a period about the instant, (r^(i-1)(t + T/2) -
     r^(i-1)(t - T/2))/T: a snap that jumps between two instants is felt in its share.
@@ -377,6 +377,24 @@ def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
 def forward_force(
     profile: Setpoint, forward: Array, time: Array, period: float
 ) -> tuple[Array, Array]:
-    """Setpoint (N,) and Σ_i F_i r^(i) (N, m) at `time`, F (5, m) of `feedforward`."""
+    """Compute the setpoint and the force ahead that is held for a period from each instant on.
+
+    Parameters
+    ----------
+    profile : Setpoint
+    forward : array (5, m)
+        F of `feedforward`, N per unit of y and s.
+    time : array (N,)
+        s.
+    period : float
+        s.
+
+    Returns
+    -------
+    r : array (N,)
+        In the unit of y.
+    force : array (N, m)
+        F_0 r + Σ_i F_i mean r^(i), N.
+    """
     r = held_setpoint(profile, time, period)
     return r[0], r.T @ forward

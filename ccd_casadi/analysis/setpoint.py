@@ -149,11 +149,16 @@ class FeedforwardOptions:
 
 
 def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
-    """Gains of the feedforward of a setpoint, u = Σ_i F_i r^(i).
+    """Gains of the feedforward of a setpoint, u = F_0 r + Σ_i F_i mean r^(i), as `forward_force`.
 
-    Taylor coefficients of the inverse of the plant behind hold and delay, by Cauchy's integral on a
-    circle within which it is analytic: its aliasing error is radius^(points - order). Free bodies
-    have F_0 = 0, without dampers F_1 = 0.
+    A force that is held for a period has to be the mean of what is needed over it, which a jerk or
+    snap that jumps inside makes of the means of the derivatives. With x = sT/2 hold and mean are
+    sinh(x)/x each, so that y = r at the instants up to s⁴ by the Taylor coefficients of
+
+        F_0 + Σ_i F_i s^i sinh(x)/x = e^(s(τ + T/2)) x/sinh(x) G(s)⁻¹
+
+    by Cauchy's integral on a circle within which it is analytic: its aliasing error is
+    radius^(points - order). Free bodies have F_0 = 0, without dampers F_1 = 0.
 
     Parameters
     ----------
@@ -188,22 +193,25 @@ def feedforward_slopes(
     """
     count, terms = options.points, options.order + 1
     poles = np.abs(plant.poles)
-    zeros = plant.zeros(float(poles.max()))
-    nearest = min([*np.abs(zeros), poles.max()])
-    if not nearest > 1e-9 * poles.max():
+    fastest = float(poles.max())  # 0 of masses alone, whose inverse is analytic everywhere
+    nearest = min([*np.abs(plant.zeros(fastest or 1.0)), fastest or np.inf])
+    if not nearest > 1e-9 * fastest:
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
     late = delay + 0.5 * period
-    radius = options.radius * nearest
-    if radius * late > 1.0:  # where exp stays of size one
-        radius = 1.0 / late
+    stays = 1.0 / late if late > 0.0 else max(fastest, 1.0)  # where exp stays of size one
+    radius = min(options.radius * nearest, stays)
     s = radius * np.exp(2j * np.pi * np.arange(count) / count)
     X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
     G = plant.C @ X + plant.D
     inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
-    ahead = np.exp(s * late)[:, None, None]
+    x = 0.5 * period * s
+    hold = (x / np.sinh(x) if period else np.ones_like(s))[:, None, None]
+    ahead = hold * np.exp(s * late)[:, None, None]
 
     def series(values: np.ndarray) -> Array:
-        found = np.fft.fft(ahead * values, axis=0).real[:terms] / count
+        first = (ahead * values).mean(axis=0)  # of r itself, which is not a mean
+        found = np.fft.fft(hold * (ahead * values - first), axis=0).real[:terms] / count
+        found[0] += first.real
         size = np.abs(values).max(axis=0)
         size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
         found[np.abs(found) <= options.rounding * size] = 0.0

@@ -35,6 +35,7 @@ from ccd_casadi.cases.plant_findings import (
 )
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.inner_problem.structured_plant_set import with_ranges
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import modal_plant, require_damping, without_hidden_rigid_modes
@@ -49,7 +50,7 @@ from ccd_casadi.plants.plant import (
 )
 from ccd_casadi.plants.plant_facts import PlantFacts, facts_of
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.text import is_force, number, of_newtons, plural, spoken
 
@@ -311,6 +312,7 @@ def plant_report(
             {"name": name, "value": float(value), "met": bool(value <= 0.0), "open": between}
             for name, value in constraints
         ],
+        "move": _move(problem),
         "budget": [  # each source by the RMS of its spectrum; None where it is white
             {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
             for s in (problem.budget.sources if problem.budget else ())
@@ -320,6 +322,31 @@ def plant_report(
             for f in first_seen(findings)
         ],
     }
+
+
+def _move(problem: CoDesignProblem) -> dict[str, Any] | None:
+    """The move at the start of θ and what it needs by its rigid body, keys as in result.json; None
+    where the case has none, or the plant cannot make it."""
+    motion = problem.source.motion
+    if motion is None:
+        return None
+    try:
+        found = motion_of(problem, problem.start)
+    except UserError:  # what designs a controller reports it
+        return None
+    cycle, motor, of_motor = found.cycle, motion.motor, {}
+    if motor is not None:
+        k, _, i_peak = map(float, motor.at(found.mass))
+        of_motor = {
+            "peak_current": cycle.peak_force / k, "rms_current": cycle.rms_force / k,
+            "current_limit": i_peak if i_peak < motor.unlimited else None,
+            "power": cycle.power, "power_limit": motor.rms_power,
+        }  # fmt: skip
+    return {
+        "distance": motion.limits.stroke, "duration": cycle.profile.duration,
+        "limits": list(cycle.limits), "peak_force": float(cycle.peak_force),
+        "rms_force": float(cycle.rms_force), **of_motor,
+    }  # fmt: skip
 
 
 def size_words(

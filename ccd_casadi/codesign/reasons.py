@@ -61,7 +61,7 @@ class Reason(Enum):
     NORM = "norm {norm:.6g} <= {norm_bound:.6g}"
     JUDGED_ON_MODEL = "stable and within every bound on the model that it was designed on"
     JUDGED_ON_PLANTS = (
-        "stable and within every bound on the {plants} plants that it was designed on"
+        "stable and within every bound on the {plants} plants of its set that the search kept"
     )
     ON_GRID_ALONE = "{on_grid_alone:list}: judged on a grid of frequencies alone"
     DESIGNED_ON = "{words}, on which it was designed"
@@ -101,7 +101,9 @@ class Reason(Enum):
     NONE_BETTER = "{tried}, none better at {checked_at}"
     MOVED = "moved by the global check: the formulation ended at J = {objective_before:.6g}"
     CHECKED = "checked at {checked_at}"
-    NOT_REPEATED = "its best was not found again from {multistart:count start}"
+    NOT_REPEATED = (
+        "only {best_found} of {multistart:count controller start} ended at its controller"
+    )
     MULTISTART = "a multi-start search at this theta ended at {local_optima_hz:distinct} Hz"
     MULTISTART_OF = (
         "a multi-start search at this theta ended at {local_optima_hz:distinct} Hz, from there at "
@@ -124,8 +126,8 @@ class Reason(Enum):
     PREDICTED = "{what} predicted, error {error:share}"
     EXTRAPOLATES = "the surrogate extrapolates there: {outside}"
     LEFT_OUT = (
-        "the surrogate without this design misses its {what} by {size:.2g} {unit} "
-        "({left_out:100*.2g} %, {left_out_sigmas:.1f} sigma)"
+        "a surrogate without this design misses its {what} by {size:.2g} {unit} "
+        "({left_out:100*.2g} %), {left_out_sigmas:.1f} times the error it expects"
     )
     LEFT_OUT_TOO_FAR = f"{LEFT_OUT}: do not use it here"
     COMPUTED = "the {what} itself is computed, not predicted"
@@ -150,7 +152,7 @@ class Reason(Enum):
         "unstable within the [robust] set, at {shift:100*+.2g} %, damping x {damping:.3g}"
     )
     SET_KEPT = (
-        "the [robust] set is kept ({plants} plants, worst peak of S {peak:.4g} at "
+        "the [robust] set is kept ({plants} plants checked, worst peak of S {peak:.4g} at "
         "{shift:100*+.2g} %, damping x {damping:.3g})"
     )
     SET_NOT_KEPT = (
@@ -159,9 +161,12 @@ class Reason(Enum):
     )
     MODEL_ALONE = "judged on the model alone: [robust] names no plant"
     SET_WITHIN = "{within} on the [robust] set: {proof_of_set}"
-    TRIED_WITHIN = "{within} on {plants:count plant} of the [robust] set"
-    JUDGED_ON = "judged on {plants:count plant} of the [robust] set"
-    ON_PLANTS = "on {plants:count plant} of the [robust] set"
+    TRIED_WITHIN = "{within} on {plants:count plant} checked of the [robust] set"
+    JUDGED_ON = (
+        "checked on {plants:count plant} of the [robust] set: those that the search kept, its "
+        "corners and points between"
+    )
+    ON_PLANTS = "on {plants:count plant} checked of the [robust] set"
     PROOF = "{words}"
     DRAWN = "{words}"
     OTHER_DAMPING = "{words}"

@@ -173,7 +173,9 @@ def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, A
     return {
         "plants": plants,
         "passed": wide.passed,
-        "words": f"stable, {within} on {plural(plants, 'plant')}" if wide.passed else wide.words,
+        "words": f"stable, {within} on {plural(plants, 'plant')} checked"
+        if wide.passed
+        else wide.words,
         "bandwidth_hz": wide.bandwidth / HZ,
         "worst_excess": excess,
     }

@@ -6,6 +6,7 @@ from math import isfinite
 
 import numpy as np
 
+from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
@@ -49,16 +50,15 @@ def ranges_of_moves(
     """
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     count = int(np.ceil(2.0 * profile.duration / held.period))
-    wanted = profile.at(np.arange(count, dtype=float) * held.period)
+    time = np.arange(count, dtype=float) * held.period
     peaks = np.zeros(n + p + m)
     for axis in range(1 if places else p):
         reference = course(plant, axis, places)[1]
-        ways = [np.zeros((count, m))]
-        if forward is not None:
-            ways.append(wanted.T @ forward_gains(forward, reference, axis, places))
-        for ahead in ways:
+        for way in (None,) if forward is None else (None, forward):
+            gains = forward_gains(way, m, reference, axis, places)
+            wanted, ahead = forward_force(profile, gains, time, held.period)
             x, z = np.zeros(len(held.A)), np.zeros(n)
-            for r, f in zip(wanted[0], ahead, strict=True):
+            for r, f in zip(wanted, ahead, strict=True):
                 e = reference * r - held.C @ x
                 u = K.C @ z + K.D @ e + f
                 peaks = np.maximum(peaks, np.abs(np.concatenate([z, e, u])))

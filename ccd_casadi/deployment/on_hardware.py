@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.move import Move, forward_force
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
@@ -98,10 +98,9 @@ def move(
     T, n, m = realisation.system.period, len(plant.A), len(realisation.system.C)
     count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
-    wanted, (output, reference) = profile.at(time), course(plant, axis, places)
-    ahead = np.zeros((count, m))
-    if forward is not None:
-        ahead = wanted.T @ forward_gains(forward, reference, axis, places)
+    output, reference = course(plant, axis, places)
+    gains = forward_gains(forward, m, reference, axis, places)
+    wanted, ahead = forward_force(profile, gains, time, T)
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
@@ -123,8 +122,8 @@ def move(
     arriving, clipped = 0, 0
     for k in range(count):
         y = plant.C @ x
-        r = reference * wanted[0, k]
-        error[k] = aim * wanted[0, k] - rows @ x
+        r = reference * wanted[k]
+        error[k] = aim * wanted[k] - rows @ x
         if actuators is not None:
             force[k] = actuators @ x
         u, limited = controller(r - _quantise(y, hardware.sensor_step), ahead[k])
@@ -140,7 +139,7 @@ def move(
             x = step[:, :n] @ x + step[:, n:] @ u_now
             now = following
     only = actuators is None  # then the command is the force
-    return Move(time, wanted[0], error, command if only else force, forward is not None,
+    return Move(time, wanted, error, command if only else force, forward is not None,
                 profile.duration, window, saturated=clipped / count,
                 command=None if only else command)  # fmt: skip
 
@@ -187,9 +186,12 @@ def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, b
 
 
 def forward_gains(
-    forward: Array, reference: Array, axis: int, places: Sequence[BreakPoint] = ()
-) -> Array:
-    """Feedforward (5, m) of a setpoint's derivatives; `reference` (p,) as of `course`."""
+    forward: Array | None, inputs: int, reference: Array, axis: int,
+    places: Sequence[BreakPoint] = (),
+) -> Array:  # fmt: skip
+    """Feedforward (5, m) as of `forward_force`, 0 without any; `reference` (p,) as of `course`."""
+    if forward is None:
+        return np.zeros((5, inputs))
     return np.asarray(forward @ reference if places else forward[:, :, axis])
 
 

@@ -295,6 +295,7 @@ def _judge(run: FinishedRun, found: Deployment) -> Judgement:
     where = f" (broken at {', '.join(one.name for one in own.places)})" if own.places else ""
     kept = [f"S_max{where}", "S_low", *(["compliance_max"] if most is not None else [])]
     words = f"stable and within {', '.join(kept)} on {plural(len(plants), 'plant')}"
+    words += " checked of the [robust] set" if len(plants) > 1 else ""
     figures = dict(judged.figures)
     if own.weighted_level is not None:
         own = own if own.places else replace(own, channels=())

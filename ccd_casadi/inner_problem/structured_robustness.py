@@ -335,7 +335,7 @@ def violations(
         if worse:
             break
     if log is not None:
-        log(f"{of_a_bound(heads[0].value)} at most on {examined} plants")
+        log(f"{of_a_bound(heads[0].value)} at most on {examined} plants tried of the set")
     return heads[0], worse
 
 

@@ -40,7 +40,7 @@ from ccd_casadi.reporting.gain_figures import S_panel, run_view
 from ccd_casadi.reporting.limit_figures import binding_words
 from ccd_casadi.reporting.machine import find_lumped, loci, lumped_svg
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.support.text import HZ, display_unit, number, plural, template, with_unit
+from ccd_casadi.support.text import HZ, display_unit, number, template, with_unit
 from surrogates.files import write_whole
 
 _change = partial(change_words, digits=1, none="unchanged")
@@ -133,7 +133,7 @@ def _lead(run: FinishedRun) -> str:
     """Describe what was chosen and what it reaches, in words that need no other page."""
     result = run.result
     count = result.get("judge", {}).get("plants", 1)
-    plants = "on its model" if count == 1 else f"on every one of {plural(count, 'plant')}"
+    plants = "on its model" if count == 1 else f"on every one of {count} plants checked of its set"
     theta = theta_words({k: v for k, v in result.items() if k != "varies"})
     varies = theta_words({**result, "theta": {}, "fixed": {}})
     over = f", {varies}" if varies else ""
@@ -210,7 +210,10 @@ def evidence(result: Mapping[str, Any]) -> str:
     """Describe who judged a design, and which of its requirements are proven."""
     judge = result.get("judge", {})
     second = result.get("second_engine", {}).get("words", "")
-    words = [f"An independent judge (NumPy, on the matrices as written): {judge.get('words', '')}"]
+    several = judge.get("passed") and judge.get("plants", 1) > 1
+    of_set = " checked of its set" if several else ""
+    judged = f"{judge.get('words', '')}{of_set}"
+    words = [f"An independent judge (NumPy, on the matrices as written): {judged}"]
     required = result.get("requirements", ())
     proven = [one["name"] for one in required if one["evidence"] == "proven"]
     if proven:

@@ -5,6 +5,7 @@ or the current of its motor; what must be known of its resonances; what if the m
 model.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,9 +14,13 @@ from typing import Any
 from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import OwnSet, State, clauses_of
 from ccd_casadi.drawing.content import VerdictRow
-from ccd_casadi.support.text import inwards, number, spoken, with_unit
+from ccd_casadi.fixed_structure.bounds import key_words, kind_and_channel
+from ccd_casadi.support.text import inwards, number, plural, spoken, with_unit
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
+
+
+TIGHTENED = ("S_MAX", "S_LOW", "KS", "T", "GS")  # bounds that a key of the case states
 
 
 class ConcernKind(StrEnum):
@@ -63,6 +68,7 @@ class ConcernOptions:
     overshoot: float = 0.5  # of a step without feedforward
     between_lines: float = 1.1  # what |S| may reach between lines, over the largest on them
     identified: float = 0.05  # relative: how well resonances are known where nothing else is stated
+    open_by: float = 0.05  # relative: up to which a proof that did not close is worth its figure
 
 
 def limited_move(result: Mapping[str, Any]) -> str:
@@ -222,6 +228,52 @@ def why_unproven(result: Mapping[str, Any]) -> str | None:
         return None
     own = result["verdict"]["survives"].get("set")
     return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
+
+
+@dataclass(frozen=True)
+class OpenBound:
+    """What a proof over a set leaves open of its worst bound, in words; empty where it is much."""
+
+    words: str = ""
+    remedy: str = ""
+
+
+def open_bound(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> OpenBound:
+    """Describe by how much the proof over the [robust] set misses a bound, and what closes it.
+
+    A bound that is stated tighter by that share ends with a proof of the one that is needed: the
+    search ends at its bounds, and the proof as far above them.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    options : ConcernOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    OpenBound
+    """
+    line = result.get("verdict", {}).get("survives", {})
+    levels = {key: math.inf if level is None else level
+              for key, level in (line.get("proven") or {}).items()}  # fmt: skip
+    name = max(levels, key=levels.__getitem__, default="")
+    over = levels.get(name, math.inf) - 1.0
+    if line.get("proof") != "looser" or not 0.0 < over <= options.open_by:
+        return OpenBound()
+    share = f"{math.ceil(1e5 * over - 1e-6) / 1e3:g} %"  # never less than it is
+    bound = key_words(name)
+    words = (
+        f"on the whole [robust] set {bound} is proven only up to {share} above its bound (the "
+        f"{plural(line['plants'], 'plant')} checked of it keep their bounds)"
+    )
+    accept = f"accept these {share}"
+    if kind_and_channel(name)[0] in TIGHTENED:
+        accept += f", or state {bound} {share} tighter than you need it"
+    return OpenBound(words, f"{accept}; a smaller [robust] set needs fewer boxes of the proof")
 
 
 def percent_words(share: float, digits: int) -> str:

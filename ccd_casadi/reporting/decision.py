@@ -19,9 +19,11 @@ from ccd_casadi.reporting.concerns import (
     limited_move_remedy,
     lines_of,
     loop_concerns,
+    open_bound,
     resonance_condition,
     why_unproven,
 )
+from ccd_casadi.reporting.remarks import remarks
 
 NEXT = {  # what to do about a line that failed, or about what the decision names
     "certified": "make the run again",
@@ -97,6 +99,7 @@ class Decision:
     beside: tuple[Concern, ...] = ()  # what else speaks against a design that must not be built
     unjudged: bool = False  # hold and delay are not judged yet
     condition: str = ""  # what must be known of the resonances, in a sentence; empty: nothing
+    remarks: tuple[str, ...] = ()  # what whoever builds it has to know besides, a sentence each
 
     @property
     def words(self) -> str:
@@ -106,7 +109,7 @@ class Decision:
         parts += [f"Next: {'; '.join(self.steps)}."] if self.steps else []
         if self.unjudged and self.build is Build.IF_ACCEPTED:
             parts.append("Deploy it first: hold and delay are not judged yet.")
-        return " ".join(part for part in (*parts, self.condition) if part)
+        return " ".join(part for part in (*parts, self.condition, *self.remarks) if part)
 
     @property
     def builds(self) -> bool:
@@ -177,10 +180,10 @@ def decide(result: Mapping[str, Any]) -> Decision:
         concerns.append(Concern(ConcernKind.LINE_UNKNOWN, words))
     concerns += loop_concerns(result)
     unjudged = states.get("deployable") == State.UNKNOWN
-    condition = resonance_condition(result)
+    condition, besides = resonance_condition(result), remarks(result)
     if not concerns:
         build = Build.AFTER_DEPLOY if unjudged else Build.YES
-        return Decision(build, unjudged=unjudged, condition=condition)
+        return Decision(build, unjudged=unjudged, condition=condition, remarks=besides)
     remedies = {
         ConcernKind.NOT_OPTIMAL: "optimal",
         ConcernKind.SET_UNPROVEN: "unproven",
@@ -191,8 +194,9 @@ def decide(result: Mapping[str, Any]) -> Decision:
         ConcernKind.BUDGET: "budget",
     }
     present = {one.reason for one in concerns}
-    steps = tuple(dict.fromkeys(NEXT[name] for why, name in remedies.items() if why in present))
-    return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition)
+    next_ = NEXT | {"unproven": open_bound(result).remedy or NEXT["unproven"]}
+    steps = tuple(dict.fromkeys(next_[name] for why, name in remedies.items() if why in present))
+    return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition, besides)
 
 
 def advice(result: Mapping[str, Any]) -> str:
@@ -240,8 +244,8 @@ def _survival_concerns(result: Mapping[str, Any], state: str | None) -> list[Con
     own = result["verdict"].get("survives", {}).get("set")
     if state == State.WARNED:
         if own == OwnSet.UNPROVEN:
-            words = "the bounds are not proven on the whole [robust] set"
-            return [Concern(ConcernKind.SET_UNPROVEN, words)]
+            open_ = "the bounds are not proven on the whole [robust] set"
+            return [Concern(ConcernKind.SET_UNPROVEN, open_bound(result).words or open_)]
         if own == OwnSet.KEPT and (doubt := _unstable_controller(result)):
             return [Concern(ConcernKind.UNSTABLE_CONTROLLER, doubt)]
         if own == OwnSet.NONE:

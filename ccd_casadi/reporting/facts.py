@@ -274,7 +274,7 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
     if r["formulation"] == "direct":
         return ""
     if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
-        return "a training sample of the surrogate"  # which repeats it
+        return "not a prediction: the surrogate was fitted with this design"
     return f"predicted {guess} (error {small_share(r['verification_error'])})"
 
 

@@ -37,7 +37,7 @@ def bandwidths_table(verified: "VerifiedStructured") -> c.Table:
     assert design.controller is not None
     sampling, plants = structured_of(problem).sampling, design.certificate.plants
     as_run = "continuous" if sampling is None else f"as sampled at {number(sampling.rate_hz)} Hz"
-    least = f"the least of {plural(len(plants), 'plant')} of the set, which J counts"
+    least = f"the least of {plural(len(plants), 'plant')} that the search kept, which J counts"
     rows = [(least, as_run, design.certificate.bandwidth),
             ("the model", as_run, plants[0].crossing)]  # fmt: skip
     if sampling is not None:
@@ -87,7 +87,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
     loop, v = "sampled" if sampled else "continuous", problem.figure
     least = "" if v.larger_is_better else f", of the least {v.words}"
-    whole = f"{plural(result['certificate']['plants'], 'plant')} of the set"
+    whole = f"{plural(result['certificate']['plants'], 'plant')} that the search kept"
     bound = hz(gap.get("bandwidth_bound_hz"))
     rows = [
         ("no controller of any order exceeds", gap.get("plants", "the model"), loop, bound),

@@ -417,3 +417,33 @@ def test_a_constraint_that_no_point_meets_is_warned_of(
              if "too light" in item.words]  # fmt: skip
     assert len(found) == warned
     assert not warned or "met at none of" in found[0]
+
+
+def test_check_shows_what_a_move_needs_at_the_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Force by the mass times the acceleration, current by the force constant, heat by resistance:
+    masses of case study 1 at 1 m/s² with 50 N/A and 2 ohm."""
+    path = case_file(tmp_path, GOOD)
+    of = path.read_text()
+    mass = sum(problem_of(load_case(path)).start)
+    move = "[move]\ndistance = 0.1\nvelocity = 0.2\nacceleration = 1.0\njerk = 100.0\n"
+    move += "settle_band = 1e-6\ndwell = 0.1\n"
+    motor = "[motor]\nforce_constant = 50.0\nresistance = 2.0\npeak_current = 5.0\n"
+    motor += "rms_power = 9.0\n"
+    path.write_text(f"{of}{move}")
+    check([str(path)])
+    words = capsys.readouterr().out
+    assert f"{mass:.3g} N peak" in words
+    assert "current" not in words
+    path.write_text(f"{of}{move}{motor}")
+    check([str(path), "--json"])
+    found = json.loads(capsys.readouterr().out)["move"]
+    assert found["peak_force"] == pytest.approx(mass, rel=1e-6)
+    assert found["rms_force"] < found["peak_force"]
+    assert found["peak_current"] == pytest.approx(found["peak_force"] / 50.0)
+    assert found["power"] == pytest.approx(2.0 * found["rms_current"] ** 2)
+    check([str(path)])
+    words = capsys.readouterr().out
+    assert f"of 5 A allowed ({100.0 * found['peak_current'] / 5.0:.3g} %)" in words
+    assert "of the 9 W allowed" in words

@@ -190,7 +190,7 @@ def test_a_prediction_at_its_own_sample_counts_without_it() -> None:
     hollow = predicted(6e-12, HZ * 1.56 / 0.022, (1.56, 3.5))
     assert hollow.state is v.State.WARNED
     assert "1.6 Hz" in hollow.words
-    assert "3.5 sigma" in hollow.words
+    assert "3.5 times the error it expects" in hollow.words
     far = predicted(2e-3)
     assert far.state is v.State.FAILED
     assert predicted(1e-5).state is v.State.PASSED

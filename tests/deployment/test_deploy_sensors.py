@@ -11,7 +11,7 @@ from oracles.structured_text import run as run_text
 from oracles.two_encoders import DELAY, EXAMPLE, RATE, axis, broken, by_hand, held
 
 from ccd_casadi.analysis import LIMITS
-from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move import held_setpoint, simulate
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -162,7 +162,7 @@ def test_a_move_sends_its_setpoint_to_both_encoders(
     assert not forward[:, :, 0].any()
     assert forward[2, 0, 1] == pytest.approx(1.0 / (axis()[1][2, 0] ** -1 + 120.0) ** -1, rel=1e-6)
     made = move(G, found.realisation, DELAY, profile, places=places, forward=forward)
-    r = profile.at(made.time)
+    r = held_setpoint(profile, made.time, T)
     F, now, before, d = held(0.0, T, DELAY)
     x, z, sent, errors = np.zeros(4), np.zeros(len(K.A)), [0.0] * (d + 2), []
     for wanted, ahead in zip(r[0], r.T @ forward[:, 0, 1], strict=True):

@@ -18,6 +18,7 @@ from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.analysis import MoveLimits
 from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.move import simulate as simulate_move
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
 from ccd_casadi.deployment.on_hardware import (
     BACK,
@@ -37,7 +38,7 @@ from ccd_casadi.deployment.realisation import (
 )
 from ccd_casadi.deployment.source_code import vectors
 from ccd_casadi.extensions.formats.code_formats import structured_text
-from ccd_casadi.lti.loop import zoh
+from ccd_casadi.lti.loop import Loop, Sampling, zoh
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import Mechanics
@@ -102,12 +103,13 @@ def test_feedforward_inverts_the_plant_to_fifth_order(seed: int, inputs: int) ->
     G = StateSpace(np.linalg.solve(T, G.A @ T), np.linalg.solve(T, G.B @ mix), G.C @ T, G.D)
     F = feedforward(G, PERIOD, delay)
     misses = []
+    sampled = zoh(G, PERIOD, delay)
     for w in (200.0, 400.0):
         s = 1j * w
-        g = G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B)
-        ahead = sum(F[k] * s**k for k in range(5))
-        late = np.exp(-s * (delay + PERIOD / 2))
-        misses.append(np.abs(g @ ahead * late - np.eye(inputs)).max())
+        g = sampled.response(np.array([w]))[0]
+        mean = np.sinh(s * PERIOD / 2) / (s * PERIOD / 2)
+        ahead = F[0] + mean * sum(F[k] * s**k for k in range(1, 5))
+        misses.append(np.abs(g @ ahead - np.eye(inputs)).max())
     assert misses[1] < 2e-3
     assert misses[0] < misses[1] / 2**2.5  # the next term is of third order against the mass
     np.testing.assert_allclose(mix @ F[2], 10.0 * np.eye(inputs), rtol=0, atol=1e-4)
@@ -189,6 +191,28 @@ def test_an_integrator_takes_over_for_good() -> None:
     x = takeover(K.system) @ np.array([0.0, 7.0])
     u = difference_equation(K, np.zeros((500, 1)), start=x.tolist())
     np.testing.assert_allclose(u, 7.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("snap", [1e4, 1e12])
+@pytest.mark.parametrize("held", [0.0, 1.6e5])
+def test_the_deployed_move_is_that_of_solve_and_follows_a_jerk_that_jumps(
+    snap: float, held: float
+) -> None:
+    """One force ahead for both. On an exact plant little is left, also where the jerk jumps between
+    two instants: 0.2 nm; by values at the instants 10 mm and more of drift."""
+    M, D, K = 10.0, 0.1 * np.sqrt(held * 10.0), held
+    G = StateSpace(np.array([[0.0, 1.0], [-K / M, -D / M]]), np.array([[0.0], [1.0 / M]]),
+                   np.array([[1.0, 0.0]]), np.zeros((1, 1)))  # fmt: skip
+    profile, F = setpoint(MoveLimits(0.01, 0.2, 5.0, 500.0, snap)), feedforward(G, PERIOD, DELAY)
+    of_deploy = move(G, pid(), DELAY, profile, forward=F)
+    loop = Loop(G, pid().system, Sampling(1.0 / PERIOD, 1e6 * DELAY))
+    of_solve = simulate_move(loop, profile, axis=0, forces=F[:, :, 0], window=1e-6,
+                             bandwidth_hz=40.0)  # fmt: skip
+    count = min(len(of_deploy.time), len(of_solve.time))
+    np.testing.assert_allclose(
+        of_deploy.error[:count, 0], of_solve.error[:count], rtol=0.0, atol=1e-12
+    )
+    assert of_deploy.peak_error < 1e-9
 
 
 def made(K: Realisation, **also: object) -> Move:

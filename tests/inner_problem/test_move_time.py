@@ -184,17 +184,19 @@ def test_the_motor_on_the_plant() -> None:
     assert (dM.reshape(3, -1).T * theta) == pytest.approx(numeric, abs=1e-9)
 
 
-@pytest.mark.parametrize("stiffness", [4e3, 50.0, -3e3])
-def test_the_force_that_holds_an_output_counts_in_its_cycle(stiffness: float) -> None:
-    """There and back over a spring or a magnet, against sums over 200,000 instants."""
+@pytest.mark.parametrize(("stiffness", "viscous"), [(4e3, 0.0), (50.0, 30.0), (-3e3, 60.0)])
+def test_the_force_that_holds_an_output_counts_in_its_cycle(
+    stiffness: float, viscous: float
+) -> None:
+    """There and back over a spring or a magnet with a damper, against sums over 200,000 instants."""
     limits, mass, dwell = MoveLimits(0.01, 0.2, 5.0, 1e3, 1e6), 3.0, 0.05
-    h, g = np.array([stiffness]), np.array([mass])
+    h, g = np.array([[stiffness], [viscous]]), np.array([mass])
     found = cycle_of(moving(MOTOR, limits, dwell), g, 0.0, h)
     T = found.profile.duration
     t = np.linspace(0.0, T, 200001)
     r = found.profile.at(t)
-    there, back = (stiffness * x + mass * a for x, a in
-                   ((r[0], r[2]), (limits.stroke - r[0], -r[2])))  # fmt: skip
+    there, back = (stiffness * x + viscous * v + mass * a for x, v, a in
+                   ((r[0], r[1], r[2]), (limits.stroke - r[0], -r[1], -r[2])))  # fmt: skip
     rest = dwell * (stiffness * limits.stroke) ** 2
     mean = (np.trapezoid(there**2 + back**2, t) + rest) / (2.0 * (T + dwell))
     most = max(np.abs(there).max(), np.abs(back).max(), abs(stiffness * limits.stroke))
@@ -207,14 +209,16 @@ def test_the_force_that_holds_an_output_counts_in_its_cycle(stiffness: float) ->
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_held_plant_has_its_motor_limits_with_slopes(sign: float) -> None:
-    """A table on leaf springs, or over a magnet: F = k r + m a, and derivatives by differences."""
+    """A table on leaf springs, or over a magnet, with a damper: F = k r + d v + m a, and derivatives
+    by differences."""
+    damper = 8.0  # N s/m, to ground
 
     def model(theta: dict[str, ca.SX]) -> dict[str, ca.SX]:
         m, k = theta["m"], sign * theta["k"]
         stiffness = ca.blockcat([[k + 4e7, -4e7], [-4e7, 4e7]])
         return {"mass": ca.diag(ca.vertcat(m, 0.2)), "stiffness": stiffness,
-                "damping_ratio": 0.01, "input": ca.DM([1, 0]), "output": ca.DM([[0, 1]]),
-                "hardware_cost": m}  # fmt: skip
+                "damping": ca.diag(ca.vertcat(damper * m / 1.5, 0.0)), "input": ca.DM([1, 0]),
+                "output": ca.DM([[0, 1]]), "hardware_cost": m}  # fmt: skip
 
     plant = build_plant(model, ("m", "k"), {})
     motion = moving(MOTOR, MoveLimits(0.002, 0.2, 10.0, 2e3, 1e7), 0.05)
@@ -223,8 +227,8 @@ def test_a_held_plant_has_its_motor_limits_with_slopes(sign: float) -> None:
     value = constraint_values(held, theta)
     profile = setpoint(motion.limits)
     r = profile.at(np.linspace(0.0, profile.duration, 20001))
-    force = sign * 2e4 * r[0] + 1.7 * r[2]
-    most = max(np.abs(force).max(), 2e4 * 0.002)
+    forces = [sign * 2e4 * r[0] + way * damper * r[1] + 1.7 * r[2] for way in (1.0, -1.0)]
+    most = max(np.abs(forces).max(), 2e4 * 0.002)
     assert value[0] == pytest.approx(most / 300.0 - 1.0, abs=1e-4)  # the spring gives 5e-5
     late = cast(DrivenMechanics, held.evaluate).at(tuple(theta), Sampling(4000.0, 500.0))
     shares = late.cycle.peak_share, late.cycle.heat_share  # of the machine, whatever hold and delay

@@ -171,3 +171,41 @@ def test_a_design_that_keeps_every_bound_is_not_refused_for_what_it_misses(name:
         both = result_of(**{name: "failed", other: "failed"}) | {"status": "not_verified"}
         assert decide(both).build is Build.NO
     assert decide(result_of() | {"status": "not_verified"}).build is Build.NO
+
+
+def test_a_decision_names_bounds_of_theta_and_what_another_plant_or_rounding_exceeds() -> None:
+    """A requirement that is proven, or of the one plant that there is, lies at its limit."""
+    result = result_of() | {
+        "theta": {"m1": 55.0, "m2": 60.0}, "units": {"m1": "kg", "m2": "kg"},
+        "active": ["m1 lower", "S_max", "omega_S upper"],
+        "requirements": [requirement("S_max", 1.75, "proven"), requirement("T", 1.0, "judged")],
+    }  # fmt: skip
+    assert advice(result) == (
+        "Build this. m1 is at its lower bound 55 kg: a wider range may be better."
+    )
+    result |= {"active": [], "requirements": [requirement("S_max", 1.75, "searched")]}
+    assert "Nothing is left of S_max on the plants that were checked" in advice(result)
+    assert decide(result).build is Build.YES
+    result["requirements"] = [requirement("S_max", 1.75, "searched", margin=0.02)]
+    assert advice(result) == "Build this."
+    result["requirements"] = [requirement("too heavy", 0.0, "judged")]
+    assert "“too heavy”; round theta to the side that keeps this" in advice(result)
+    assert "too heavy" not in advice(result | {"verdict": result_of(survives="failed")["verdict"]})
+
+
+def requirement(name: str, required: float, evidence: str, margin: float = 1e-9) -> dict:
+    return {"name": name, "required": required, "evidence": evidence, "margin": margin}
+
+
+@pytest.mark.parametrize(
+    ("latest", "said"), [(0.283, "after 283 ms on the worst of 5 plants"), (0.1051, ""),
+                         (None, "on the worst of 5 plants of the set not")],
+)  # fmt: skip
+def test_a_decision_names_the_move_on_the_worst_plant_beside_the_models(
+    latest: float | None, said: str
+) -> None:
+    move = {"settled": 0.105, "settled_latest": latest, "plants": 5}
+    words = advice(result_of() | {"move": move})
+    assert ("settles after 105 ms on the model" in words) == bool(said)
+    assert said in words
+    assert advice(result_of() | {"move": move | {"plants": 1}}) == "Build this."

@@ -224,6 +224,35 @@ def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
     assert run_head("", result | poor, "", "").decision == said
 
 
+@pytest.mark.parametrize(
+    ("levels", "said", "remedy"),
+    [
+        ({"S_MAX": 0.999, "GS": 1.0021}, "compliance_max is proven only up to 0.21 % above",
+         "state compliance_max 0.21 % tighter"),
+        ({"T of tilt": 1.012001, "GS": 1.0021},
+         "weighted_level of T of channel tilt is proven only up to 1.201 % above",
+         "weighted_level of T of channel tilt 1.201 % tighter"),
+        ({"CROSSING": 1.004}, "|S| at omega_b is proven only up to 0.4 % above", "accept these"),
+        ({"GS": 1.2}, "the bounds are not proven", "fewer parameters"),
+        ({"GS": None, "T": 1.01}, "the bounds are not proven", "fewer parameters"),
+    ],
+)  # fmt: skip
+def test_a_proof_that_is_open_by_a_little_says_by_how_much(
+    levels: dict, said: str, remedy: str
+) -> None:
+    result = result_of(survives="warned")
+    result["verdict"]["survives"] |= {
+        "set": OwnSet.UNPROVEN, "proof": "looser", "proven": levels, "plants": 207,
+    }  # fmt: skip
+    words = advice(result)
+    assert said in words
+    assert remedy in words.partition("Next: ")[2]
+    assert ("tighter" in words) == (remedy.endswith("tighter"))
+    result["verdict"]["survives"]["proof"] = "open"  # stability itself is open
+    assert "tighter" not in advice(result)
+    assert "fewer parameters" in advice(result)
+
+
 def test_a_decision_says_what_a_line_warns_of() -> None:
     """Not what else is good of it."""
     result = result_of(certified="warned", predicted="warned")

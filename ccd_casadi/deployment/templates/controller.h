@@ -39,7 +39,8 @@ void controller_step(controller_state *state, const {{ real }} e[CONTROLLER_ERRO
 void controller_step_forward(controller_state *state, const {{ real }} e[CONTROLLER_ERRORS],
                              const {{ real }} f[CONTROLLER_FORCES], {{ real }} u[CONTROLLER_FORCES]);
 
-/* Feedforward of one reference: its position and four derivatives r[0] .. r[4], axis from 0.
+/* Feedforward of one reference, axis from 0: r[0] is its position, r[1] .. r[4] are the means of its
+ * four derivatives over a period about the instant, r[j] = (r^(j-1)(t + T/2) - r^(j-1)(t - T/2))/T.
  * The forces are those that the plant needs {{ ahead }} s later, when they act. */
 void controller_forward(int axis, const {{ real }} r[5], {{ real }} f[CONTROLLER_FORCES]);
 
