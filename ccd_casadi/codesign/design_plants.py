@@ -8,7 +8,7 @@ the plant alone the set is widened step by step, each design polished on the pro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import named_values
@@ -25,6 +24,9 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.outer_mixed import VerifiedDesign
 
 CONTINUED = "reached by continuation from narrower ranges"
 REPORTED = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
@@ -122,7 +124,7 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Describe why a search failed: where it searched, how near it came, what may be tried."""
     problem, words = sampler.problem, str(best.result["reason"])
     if best.verified is not None:
-        figures = cast(VerifiedDesign, best.verified).design.figures
+        figures = cast("VerifiedDesign", best.verified).design.figures
         missed = " and ".join(missed_bounds(problem.inner, figures))
         parts = [words, missed, remedies(problem, share) if missed else ""]
         return "; ".join(part for part in parts if part)

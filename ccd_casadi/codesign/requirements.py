@@ -13,7 +13,6 @@ from typing import Any
 
 from ccd_casadi.analysis import MOTOR_LIMITS
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import constraint_sizes
@@ -96,7 +95,7 @@ def requirements(verified: Verified, peak_hz: float) -> tuple[Requirement, ...]:
     proven = verified.proven_figures()
     evidence = Evidence.SEARCHED if judged.plants > 1 else Evidence.JUDGED
     found = []
-    of_set = verified.robust if isinstance(verified, VerifiedDesign) else None
+    of_set = verified.robust
     for name, share in judged.figures.items():
         if name in required:
             achieved = share * required[name] if isfinite(share) else nan

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.final_judgement import OtherDamping, judge_on_model
+from ccd_casadi.codesign.final_judgement import OtherDamping, RobustCheck, judge_on_model
 from ccd_casadi.codesign.outer_problem import FormulationResult, GlobalCheck, outputs_of
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.codesign.result_entries import controller_dict
@@ -64,6 +64,8 @@ class Verified(ABC):
         Another engine on its loops.
     between : BetweenSamples or None
         S between the samples of a loop that was designed as sampled.
+    robust : RobustCheck or None
+        All along the case's own set, of a design that is judged on its model alone.
     """
 
     problem: CoDesignProblem
@@ -79,6 +81,7 @@ class Verified(ABC):
     damping: OtherDamping | None
     second: EngineComparison = NOT_COMPARED
     between: "BetweenSamples | None" = None
+    robust: RobustCheck | None = None
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
     saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards

@@ -24,7 +24,7 @@ from ccd_casadi.synthesis.closed_loop import measure
 
 if TYPE_CHECKING:
     from ccd_casadi.budget.evaluation import BudgetFigures
-    from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+    from ccd_casadi.codesign.outer_mixed import VerifiedDesign
     from ccd_casadi.codesign.verified_structured import VerifiedStructured
 
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing

@@ -15,7 +15,7 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.gaussian_processes import recommendation
-from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.codesign.outer_mixed import VerifiedDesign
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.facts import (

@@ -14,11 +14,11 @@ import numpy as np
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.final_judgement import judge_survival
+from ccd_casadi.codesign.outer_mixed import set_findings
 from ccd_casadi.codesign.result_entries import figures_dict
 from ccd_casadi.codesign.structured_entries import active_of, box_findings, design_dict
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verdict import Check, survives
-from ccd_casadi.codesign.verified_mixed import set_findings
 from ccd_casadi.fixed_structure.design import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import kind_of

@@ -13,6 +13,7 @@ from oracles.helpers import few, problem
 
 from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.codesign.final_judgement import OtherDamping, judge_survival
+from ccd_casadi.codesign.outer_mixed import set_findings
 from ccd_casadi.codesign.survival import (
     PEAK,
     LoopsOffModel,
@@ -25,7 +26,6 @@ from ccd_casadi.codesign.survival import (
     survival,
 )
 from ccd_casadi.codesign.verdict import State, survives
-from ccd_casadi.codesign.verified_mixed import set_findings
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.lti.loop import Sampling, zoh
 from ccd_casadi.lti.norms import hinf_norm

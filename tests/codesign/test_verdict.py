@@ -22,12 +22,12 @@ from ccd_casadi.codesign.final_judgement import judge_survival
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
 from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
+from ccd_casadi.codesign.outer_mixed import VerifiedDesign
 from ccd_casadi.codesign.outer_problem import GlobalCheck, lifted_bounds
 from ccd_casadi.codesign.reasons import Reason, within_words
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.structured_entries import robust_dict
 from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
-from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure.certificate import SetCertificate
