@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from ccd_casadi.support.command_line import ExitCode, command, option, program, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.text import plural, spoken, with_unit
 
@@ -42,7 +42,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             words.render(found, start=theta_words(found), shares=PlantReportOptions.shares).rstrip()
         )
         designs = "drive" if case.drive.name else "tolerances" if case.robust.share else "solve"
-        inform(f"next          {program(f'ccd_casadi.{designs}')} {options.case}")
+        inform(f"next          ccd {designs} {options.case}")
     return ExitCode.DONE
 
 

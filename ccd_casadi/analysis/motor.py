@@ -172,7 +172,7 @@ def _compute_held(
     motion: Motion, forces: Array, mass: Any, holding: Array,
     options: MotionOptions = MotionOptions(),
 ) -> Cycle:  # fmt: skip
-    """Compute the cycle of an output that is held with h and d per unit of position and velocity."""
+    """Compute the cycle of an output that is held, h and d per unit of place and velocity."""
     free = replace(motion, motor=None)
     found = cycle_of(free, forces)
     profile, far = found.profile, motion.limits.stroke

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.analysis.setpoint import Setpoint, feedforward
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.ports import BreakPoint, course
-from ccd_casadi.lti.state_space import ClosedLoop, closed_loop
-from ccd_casadi.plants.modal import ModalPlant
+from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.support.arrays import Array, states
+from ccd_casadi.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,8 @@ class Move:
 
     @property
     def settling(self) -> float:
-        """Time in s after the end of the setpoint at which the error leaves `window` last; 0 where
-        it never does."""
-        if np.isinf(self.settled):
-            return np.inf
-        outside = np.flatnonzero((self._size > self.window) & (self.time >= self.duration))
-        return float(self.time[outside[-1]] - self.duration) if outside.size else 0.0
+        """Time in s after the end of the setpoint from which the error stays within `window`."""
+        return max(self.settled - self.duration, 0.0)
 
     @property
     def rms_error(self) -> float:
@@ -142,7 +138,7 @@ class Move:
     @property
     def words(self) -> str:
         """The kind of feedforward, in words."""
-        return "with mass feedforward" if self.feedforward else "without feedforward"
+        return "with feedforward" if self.feedforward else "without feedforward"
 
     def until(self, seconds: float) -> "Move":
         """Cut the move off after this time."""
@@ -162,31 +158,84 @@ class Move:
         return np.sqrt(np.tensordot(spans / spans.sum(), signal[where] ** 2, 1))
 
 
-def mass_feedforward(
-    modal: ModalPlant, axis: int, places: Sequence[BreakPoint] = ()
-) -> Array | None:
-    """Forces that accelerate one output alone, by the rigid bodies.
+def forward_gains(
+    forward: Array | None, inputs: int, reference: Array, axis: int,
+    places: Sequence[BreakPoint] = (),
+) -> Array:  # fmt: skip
+    """Select the feedforward of one output.
 
     Parameters
     ----------
-    modal : ModalPlant
-        SI.
+    forward : array (5, m, p) or None
+        Of `forward_of`; None: there is none.
+    inputs : int
+        m.
+    reference : array (p,)
+        As of `course`.
     axis : int
         The output, from 0.
     places : sequence of BreakPoint
-        Of several sensors on one actuator: the output is that whose error counts.
+        Of several sensors on one actuator; else empty.
 
     Returns
     -------
-    (m,) array or None
-        N per unit acceleration; None where no rigid body moves it so.
+    array (5, m)
+        F of `forward_force`, 0 without any.
     """
-    R = modal.C[:, modal.rigid] @ modal.B[modal.rigid]  # integrators of first order are no mass
-    if places:
-        R, axis = np.array([places[0].output]) @ R, 0
-    wanted = np.eye(len(R))[axis]
-    forces = np.linalg.pinv(R) @ wanted if R.size else np.zeros(modal.B.shape[1])
-    return forces if np.allclose(R @ forces, wanted, rtol=0.0, atol=1e-6) else None
+    if forward is None:
+        return np.zeros((5, inputs))
+    return np.asarray(forward @ reference if places else forward[:, :, axis])
+
+
+def forward_of(
+    plant: StateSpace, period: float, delay: float, places: Sequence[BreakPoint]
+) -> Array:
+    """Compute `feedforward` of a plant that may have several sensors on its actuator.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        SI.
+    period, delay : float
+        s.
+    places : sequence of BreakPoint
+        Of several sensors on one actuator; else empty.
+
+    Returns
+    -------
+    array (5, m)
+        F of `feedforward`; of several sensors (5, p) of the output that counts, in the column of
+        each sensor its share in that.
+    """
+    if not places:
+        return feedforward(plant, period, delay)
+    row = np.array([places[0].output])
+    return feedforward(replace(plant, C=row @ plant.C, D=row @ plant.D), period, delay) * row
+
+
+def feedforward_of(loop: Loop, axis: int) -> Array | None:
+    """Compute the feedforward of one output of a loop as it runs, that of `solve` and `deploy`.
+
+    Parameters
+    ----------
+    loop : Loop
+        SI.
+    axis : int
+        The output, from 0.
+
+    Returns
+    -------
+    array (5, m) or None
+        F of `forward_force`; None where the plant has none.
+    """
+    run = loop.sampling
+    hold = (0.0, 0.0) if run is None else (run.period, run.delay)
+    try:
+        forward = forward_of(loop.plant, *hold, loop.at)
+    except UserError:
+        return None
+    reference = course(loop.plant, axis, loop.at)[1]
+    return forward_gains(forward, loop.plant.B.shape[1], reference, axis, loop.at)
 
 
 def moves(
@@ -243,8 +292,8 @@ def simulate(
         Of the output `axis`, from 0.
     axis : int
         See there.
-    forces : array or None
-        (m,) of `mass_feedforward`, or (5, m) of `feedforward`, by derivative of the setpoint.
+    forces : array (5, m) or None
+        F of `forward_force`; None: without feedforward.
     window : float
         Where the error has settled, unit of y.
     bandwidth_hz : float
@@ -257,9 +306,7 @@ def simulate(
     Move
         Up to the last tail.
     """
-    ahead = np.zeros((5, loop.plant.B.shape[1]))
-    if forces is not None:
-        ahead[2 if forces.ndim == 1 else slice(None)] = forces
+    ahead = np.zeros((5, loop.plant.B.shape[1])) if forces is None else forces
     closed, tail = closed_loop(*loop.as_run), options.tail / bandwidth_hz
     rows, wanted, reference = counted_rows(loop, axis, closed)
     ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz

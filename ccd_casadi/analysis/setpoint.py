@@ -1,7 +1,7 @@
 """Setpoints of fourth order, and the feedforward of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -140,12 +140,15 @@ class FeedforwardOptions:
         Of the circle, over the nearest singularity of the inverse.
     rounding : float
         Of the inverse on the circle: a coefficient that is less there is 0.
+    slow : float
+        Over the slowest pole: where inputs are shared among more of them than outputs.
     """
 
     order: int = 4
     points: int = 64
     radius: float = 0.25
     rounding: float = 1e-11
+    slow: float = 1e-3
 
 
 def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
@@ -163,7 +166,7 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     Parameters
     ----------
     plant : StateSpace
-        Stable, m inputs and p outputs, SI.
+        m inputs and p <= m outputs, SI.
     period, delay : float
         s.
 
@@ -175,9 +178,26 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     Raises
     ------
     UserError
-        The plant has a zero at s = 0: no finite force holds a position.
+        The plant has a zero at s = 0: no finite force holds a position; or more outputs than
+        inputs.
     """
-    return feedforward_slopes(plant, (), period, delay)[0]
+    share = _allocation(plant)
+    square = replace(plant, B=plant.B @ share, D=plant.D @ share)
+    return np.asarray(share @ feedforward_slopes(square, (), period, delay)[0])
+
+
+def _allocation(plant: StateSpace, options: FeedforwardOptions = FeedforwardOptions()) -> Array:
+    """The inputs (m, p) that move each output alone when slow, with the least forces: constants, so
+    that the inverse of what they leave is analytic."""
+    (_, m), p = plant.B.shape, len(plant.C)
+    if p > m:
+        raise UserError(f"the plant has {p} outputs and {m} inputs: no feedforward moves one alone")
+    if p == m:
+        return np.eye(m)
+    poles = np.abs(plant.poles)
+    moving = poles[poles > options.rounding * poles.max()]
+    slow = options.slow * moving.min(initial=np.inf)
+    return np.linalg.pinv(plant.response(np.array([slow if moving.size else 1.0]))[0].real)
 
 
 def feedforward_slopes(
@@ -203,7 +223,7 @@ def feedforward_slopes(
     s = radius * np.exp(2j * np.pi * np.arange(count) / count)
     X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
     G = plant.C @ X + plant.D
-    inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
+    inverse = np.linalg.inv(G)
     x = 0.5 * period * s
     hold = (x / np.sinh(x) if period else np.ones_like(s))[:, None, None]
     ahead = hold * np.exp(s * late)[:, None, None]

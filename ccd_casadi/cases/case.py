@@ -28,7 +28,7 @@ from ccd_casadi.support.options import DEFAULT_CASE, one_line
 from ccd_casadi.support.text import package_text, template
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
-EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
+EXAMPLE = "ccd solve my_case.toml (docs/tutorial.md writes one)"
 
 
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).

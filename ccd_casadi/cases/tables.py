@@ -168,7 +168,10 @@ class InnerTable:
         check=checks.choice(*ShapeEnd),
     )
     compliance_max: float | None = key(
-        "bound of the peak of GS, the displacement by a force at any frequency", None, unit="m/N"
+        "bound of the peak of GS, the displacement by a force at any frequency; of |z/d| where "
+        "the plant has disturbance or performance",
+        None,
+        unit="m/N",
     )
     minimise: str = key(
         "sections: what is minimised instead of the negative bandwidth",

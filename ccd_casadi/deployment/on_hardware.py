@@ -9,8 +9,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.move import Move, forward_force
-from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
+from ccd_casadi.analysis.move import Move, forward_force, forward_gains, forward_of
+from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
 from ccd_casadi.lti.loop import DelayOptions
@@ -183,42 +183,6 @@ def running(realisation: Realisation) -> Callable[[Array, Array], tuple[Array, b
         return u, bool(np.any(u != v))
 
     return in_floats
-
-
-def forward_gains(
-    forward: Array | None, inputs: int, reference: Array, axis: int,
-    places: Sequence[BreakPoint] = (),
-) -> Array:  # fmt: skip
-    """Feedforward (5, m) as of `forward_force`, 0 without any; `reference` (p,) as of `course`."""
-    if forward is None:
-        return np.zeros((5, inputs))
-    return np.asarray(forward @ reference if places else forward[:, :, axis])
-
-
-def forward_of(
-    plant: StateSpace, period: float, delay: float, places: Sequence[BreakPoint]
-) -> Array:
-    """Compute `feedforward` of a plant that may have several sensors on its actuator.
-
-    Parameters
-    ----------
-    plant : StateSpace
-        SI.
-    period, delay : float
-        s.
-    places : sequence of BreakPoint
-        Of several sensors on one actuator; else empty.
-
-    Returns
-    -------
-    array (5, m)
-        F of `feedforward`; of several sensors (5, p) of the output that counts, in the column of
-        each sensor its share in that.
-    """
-    if not places:
-        return feedforward(plant, period, delay)
-    row = np.array([places[0].output])
-    return feedforward(replace(plant, C=row @ plant.C, D=row @ plant.D), period, delay) * row
 
 
 def _quantise(value: Array, step: float) -> Array:

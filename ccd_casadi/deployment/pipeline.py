@@ -14,6 +14,7 @@ from ccd_casadi.analysis.loop_channels import (
     scalar_channels,
     whole_loop,
 )
+from ccd_casadi.analysis.move import forward_of
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
@@ -32,7 +33,6 @@ from ccd_casadi.deployment.discretise import (
 )
 from ccd_casadi.deployment.fixed_point import FixedRequest, in_fixed
 from ccd_casadi.deployment.integer_loop import ranges_of_moves, rounding_bound
-from ccd_casadi.deployment.on_hardware import forward_of
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import (
     Realisation,

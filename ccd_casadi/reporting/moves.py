@@ -9,15 +9,14 @@ import numpy as np
 from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.move import Move, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, feedforward_of, moves
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import member_loops
-from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.gain_figures import of_plants
 from ccd_casadi.support.arrays import Array
@@ -53,14 +52,14 @@ def move_blocks_of(
 
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
-        name, other = "with feedforward up to snap", ", that of [move]"
         ahead: Array | None = motion.forward
+        other = ", that of [move]"
     else:
         profile, window = setpoint(LIMITS), LIMITS.window
-        modal = free_modal(problem, mechanics(plant_of(problem), theta))
-        name, ahead = "with mass feedforward", mass_feedforward(modal, 0, loops[0].at)
-        other = "; set your own under [move]"
-    ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
+        other, ahead = "; set your own under [move]", feedforward_of(loops[0], 0)
+    ways: dict[str, Array | None] = {"without feedforward": None}
+    if ahead is not None:
+        ways["with feedforward up to snap"] = ahead
     found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end = profile.duration

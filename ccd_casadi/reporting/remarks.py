@@ -41,7 +41,8 @@ def remarks(
 
 
 def _at_bounds(result: Mapping[str, Any]) -> Iterator[str]:
-    theta, units, found = result.get("theta", {}), result.get("units", {}), []
+    theta, units = result.get("theta", {}), result.get("units", {})
+    found: list[str] = []
     for held in result.get("active", ()):
         name, _, end = held.rpartition(" ")
         if name in theta and end in ("lower", "upper"):

@@ -268,7 +268,6 @@ def _structured(found: Study) -> list[c.Chapter]:
 
 
 def _move(found: Study) -> c.Chapter:
-    ways = {"with mass feedforward" if m.feedforward else "without feedforward": [m]
-            for m in found.moves}  # fmt: skip
+    ways = {move.words: [move] for move in found.moves}
     drawn = ways_figure(ways, "The loop is simulated exactly.")
     return c.Chapter("A move", (*map(c.Words, _words("move", found)), drawn), folded=True)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
-from ccd_casadi.analysis.move import Move, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, feedforward_of, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.reasons import Reason
@@ -15,7 +15,6 @@ from ccd_casadi.codesign.verdict import Check, State
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import sigma_max
-from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.robust import Demands
 from ccd_casadi.robust.margins import (
     DiskMargin,
@@ -154,14 +153,14 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None if sampled else structured_bound(run.plant, modal, run.controller, hz),
         setpoint=profile,
-        moves=_moves(loop, modal, profile, d, omega_b / HZ),
+        moves=_moves(loop, profile, d, omega_b / HZ),
     )
 
 
 def _moves(
-    loop: Loop, modal: ModalPlant, profile: Setpoint, demands: Demands, bandwidth_hz: float
+    loop: Loop, profile: Setpoint, demands: Demands, bandwidth_hz: float
 ) -> tuple[Move, ...]:
-    ahead = mass_feedforward(modal, demands.axis, loop.at)
+    ahead = feedforward_of(loop, demands.axis)
     found = moves(
         [loop], (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
         window=demands.window, bandwidth_hz=bandwidth_hz,

@@ -11,7 +11,7 @@ from oracles.structured_text import run as run_text
 from oracles.two_encoders import DELAY, EXAMPLE, RATE, axis, broken, by_hand, held
 
 from ccd_casadi.analysis import LIMITS
-from ccd_casadi.analysis.move import held_setpoint, simulate
+from ccd_casadi.analysis.move import forward_of, held_setpoint, simulate
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -19,7 +19,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.deploy_files import controller_dict
 from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-from ccd_casadi.deployment.on_hardware import forward_of, move, on_hardware
+from ccd_casadi.deployment.on_hardware import move, on_hardware
 from ccd_casadi.deployment.outcome import DeployedRun, Deployment
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.source_code import COMPILE, write_c

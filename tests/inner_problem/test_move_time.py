@@ -188,7 +188,7 @@ def test_the_motor_on_the_plant() -> None:
 def test_the_force_that_holds_an_output_counts_in_its_cycle(
     stiffness: float, viscous: float
 ) -> None:
-    """There and back over a spring or a magnet with a damper, against sums over 200,000 instants."""
+    """There and back over a spring or magnet and a damper, against sums over 200,000 instants."""
     limits, mass, dwell = MoveLimits(0.01, 0.2, 5.0, 1e3, 1e6), 3.0, 0.05
     h, g = np.array([[stiffness], [viscous]]), np.array([mass])
     found = cycle_of(moving(MOTOR, limits, dwell), g, 0.0, h)
@@ -209,7 +209,7 @@ def test_the_force_that_holds_an_output_counts_in_its_cycle(
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_held_plant_has_its_motor_limits_with_slopes(sign: float) -> None:
-    """A table on leaf springs, or over a magnet, with a damper: F = k r + d v + m a, and derivatives
+    """A table on leaf springs, or over a magnet, with a damper: F = k r + d v + m a, and slopes
     by differences."""
     damper = 8.0  # N s/m, to ground
 

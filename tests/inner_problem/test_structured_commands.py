@@ -83,7 +83,7 @@ def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
     }  # fmt: skip
     assert len(controller["A"]) == result["controller"]["order"] == 4
     page = (run / "report.html").read_text()
-    for words in ("Nyquist", "roll-off", "What limits the bandwidth", "mass feedforward"):
+    for words in ("Nyquist", "roll-off", "What limits the bandwidth", "with feedforward"):
         assert words in page
     # more plants, or hold and delay, can only cost: the climbs start from the design itself
     for easier in ("on_model_hz", "continuous_hz"):

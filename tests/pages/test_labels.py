@@ -17,7 +17,7 @@ def move(seed: int) -> Panel:
     """An error of a move: peaks on both sides, at rest from its end on."""
     rng = np.random.default_rng(seed)
     peaks = np.exp(-(((TIME[:, None] - np.linspace(5.0, 200.0, 9)) / 14.0) ** 2))
-    curve = Curve(TIME, peaks @ rng.uniform(-1.0, 1.0, 9), "with mass feedforward")
+    curve = Curve(TIME, peaks @ rng.uniform(-1.0, 1.0, 9), "with feedforward")
     end = Level(rng.uniform(150.0, 220.0), "setpoint ends", vertical=True)
     return Panel("time (ms)", "error (nm)", (curve,), levels=(end,))
 

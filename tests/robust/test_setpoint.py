@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few, random_plant
 
 from ccd_casadi.analysis import LIMITS, MoveLimits
-from ccd_casadi.analysis.move import mass_feedforward, simulate
+from ccd_casadi.analysis.move import feedforward_of, simulate
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -26,6 +26,7 @@ from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.robust import move_of
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
@@ -122,7 +123,8 @@ def test_a_mass_driven_by_its_own_feedforward_has_no_error() -> None:
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
     loop = Loop(plant, controller)
     profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
-    move = simulate(loop, profile, axis=0, forces=np.array([3.0]), window=1e-9, bandwidth_hz=15.0)
+    ahead = feedforward_of(loop, 0)
+    move = simulate(loop, profile, axis=0, forces=ahead, window=1e-9, bandwidth_hz=15.0)
     assert move.peak_error < 1e-13
     assert move.settling == 0.0
     assert move.peak_force[0] == pytest.approx(3.0 * profile.acceleration, rel=1e-3)
@@ -145,8 +147,10 @@ def test_a_move_against_python_control() -> None:
     assert np.interp(dense, move.time, move.error) == pytest.approx(error, abs=2e-7)
     inside = np.abs(move.error) <= 1e-7
     at = move.duration + move.settling
-    assert inside[move.time > at].all()
-    assert not inside[np.flatnonzero(move.time <= at)[-1]]
+    first = int(np.argmin(np.abs(move.time - at)))
+    assert move.time[first] == pytest.approx(at, rel=1e-12)
+    assert inside[first:].all()  # from the first instant within the window on
+    assert not inside[first - 1]
 
 
 def test_a_sampled_move_tends_to_the_continuous_one() -> None:
@@ -176,20 +180,27 @@ def test_positions_and_accelerations_at_any_time() -> None:
     assert rate == pytest.approx(np.append(states[:, 2], 0.0), abs=1e-10)
 
 
+NONE = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+
+
 def test_feedforward_of_a_stage_with_several_inputs() -> None:
-    """The forces that it asks for accelerate the axis at 1 and no other one."""
-    plant = random_plant(11, rigid=3, flexible=2, inputs=3, outputs=3)
-    modal = modal_plant(mechanics(plant, (0.4, 0.5)), Suspension(0.0, 0.0))
-    for axis in range(3):
-        forces = mass_feedforward(modal, axis)
-        assert forces is not None
-        s = 1e-4j
-        G = modal.C @ np.linalg.solve(
-            s**2 * np.eye(len(modal.K)) + s * modal.D + modal.K, modal.B.astype(complex)
-        )
-        assert (s**2 * G @ forces).real == pytest.approx(np.eye(3)[axis], abs=1e-6)
-    one_sided = replace(modal, B=modal.B[:, :1])
-    assert mass_feedforward(one_sided, 0) is None
+    """It moves the axis and no other one, also with more inputs than outputs: the rest is of the
+    third order against the mass. Fewer inputs do not."""
+    for inputs, outputs in ((3, 3), (4, 2)):
+        plant = random_plant(11, rigid=2, flexible=2, inputs=inputs, outputs=outputs)
+        modal = modal_plant(mechanics(plant, (0.4, 0.5)), Suspension(0.0, 0.0))
+        G = scale_plant(modal, 1.0, bare=True).plant_si()
+        for axis in range(outputs):
+            forces = feedforward_of(Loop(G, NONE), axis)
+            assert forces is not None
+            left = []
+            for omega in (1.0, 2.0):
+                ahead = forces.T @ (1j * omega) ** np.arange(5)
+                moved = G.response(np.array([omega]))[0] @ ahead
+                left.append(np.abs(moved - np.eye(outputs)[axis]).max())
+            assert left[1] < 1e-5
+            assert left[0] < 0.2 * left[1]
+    assert feedforward_of(Loop(replace(G, B=G.B[:, :1], D=G.D[:, :1]), NONE), 0) is None
 
 
 def test_a_command_makes_the_move_of_its_case_unless_options_change_it() -> None:

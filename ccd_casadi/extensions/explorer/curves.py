@@ -10,7 +10,7 @@ from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
-from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, MoveOptions, feedforward_of, moves
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
@@ -109,7 +109,7 @@ def curves_of(design: ExploredDesign) -> Curves | None:
 def _move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
     """The move of [move], else the default one of robustness."""
     profile, window = setpoint(LIMITS), LIMITS.window
-    ahead = mass_feedforward(design.modal, 0, loop.at)
+    ahead = feedforward_of(loop, 0)
     if design.problem.source.motion is not None:
         motion = motion_of(design.problem, design.theta)
         profile, window, ahead = motion.cycle.profile, motion.motion.window, motion.forward
