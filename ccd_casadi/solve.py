@@ -158,7 +158,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is reported before anything is written
-    of_page = () if options.no_report else ("synthesis",)  # bounds of a controller of any order
+    of_page = () if options.no_report else ("synthesis",)  # the table of bandwidths
     if kernels := {*problem.controller.kernels, *of_page}:
         ensure_compiled(*sorted(kernels))  # all of them now: after the answer it would seem to hang
     folder = run_folder(options.case, options.out)

@@ -44,7 +44,7 @@ class MoveTimeOptions:
     most_rounded: float = 0.1  # of the window, for all modes together
     nothing: float = 1e-30  # share of the envelope: a mode with less has died out
     newton_steps: int = 50  # at most
-    at_once: int = 3  # plants of a task: one takes a millisecond or two
+    instants: int = 3000  # of all plants of a task, at least: 3 ms, and 1 ms to hand it over
 
 
 class _Crossing:
@@ -61,13 +61,15 @@ class _Crossing:
         self.stable, self.time = bool(np.abs(self.poles).max() < 1.0), np.inf
         if not self.stable:
             return
-        driven = np.outer(r, loop.B_r[:, 0])
-        driven[:, : len(G.A)] += f @ G.B.T
-        self.x = states(loop.A, driven)  # the last at rest but for the loop's own modes
+        # x less the rest at each setpoint, which begins at 0: at the end what is left of the modes
         self.still = np.eye(len(loop.A)) - loop.A
-        self.rest = np.linalg.solve(self.still, loop.B_r[:, 0] * r[-1])
+        rest = np.linalg.solve(self.still, loop.B_r[:, 0])
+        driven = np.outer(r - np.append(r[1:], r[-1]), rest)
+        driven[:, : len(G.A)] += f @ G.B.T
+        moving = states(loop.A, driven)
+        self.rest, self.x = rest * r[-1], moving + np.outer(r, rest)
         self.W = np.linalg.inv(self.V)
-        self.c, self.b = loop.C_y[0] @ self.V, self.W @ (self.x[-1] - self.rest)
+        self.c, self.b = loop.C_y[0] @ self.V, self.W @ moving[-1]
         self.residues = -self.c * self.b
         with np.errstate(divide="ignore"):
             self.logs = np.log(np.abs(self.residues) / window), np.log(np.abs(self.poles))
@@ -176,13 +178,14 @@ class MoveTime:
 
         Some plants at a time are spread over workers.
         """
-        kappa, period, size = np.asarray(kappa, float), self.hold.period, self.options.at_once
+        kappa, period, count = np.asarray(kappa, float), self.hold.period, len(self.plants)
         step = 1j * MotionOptions().complex_step
         stepped = self.structure.state_spaces(kappa + step * np.eye(len(kappa)))
         each = [tustin(StateSpace(*parts), period) for parts in zip(*stepped, strict=True)]
         moved = StateSpace(*(np.stack([getattr(K, part) for K in each]) for part in "ABCD"))
         with_slopes, rest = partial(_times, moved=moved), self._arguments(kappa)
-        tasks = {i: (self._sampled[i : i + size], *rest) for i in range(0, len(self.plants), size)}
+        size = -(-count // max(1, count * len(self._time) // self.options.instants))
+        tasks = {i: (self._sampled[i : i + size], *rest) for i in range(0, count, size)}
         found = dict(results(workers, with_slopes, tasks))
         times, slopes = zip(*(one for i in tasks for one in found[i]), strict=True)
         if np.inf in times:

@@ -137,7 +137,7 @@ class Backwards(Workers):
 @pytest.mark.parametrize("factor", [1.0, 1e3])
 def test_workers_share_its_plants_and_change_no_bit(factor: float) -> None:
     case, workers = moves.drawn(np.random.default_rng(5)), Backwards(1)
-    goal = replace(case.goal(), plants=case.goal().plants * 4)
+    goal = replace(case.goal(), plants=case.goal().plants * 20)
     kappa = case.kappa + np.log([factor, *np.ones(len(case.kappa) - 1)])
     there, here = goal.at(kappa, workers), goal.at(kappa)
     assert workers.tasks > 1
@@ -155,7 +155,7 @@ def test_its_derivatives(seed: int) -> None:
     value, to_kappa = goal.at(case.kappa)
     assert value >= np.log(goal.motion.cycle.profile.duration)
     numeric = slopes(lambda kappa: np.array([goal.at(kappa)[0]]), case.kappa, 5e-5)[0]
-    assert to_kappa == pytest.approx(numeric, abs=1e-6)
+    assert to_kappa == pytest.approx(numeric, abs=3e-7)  # 1.2e-7 was met
     fixed = replace(case.motion.limits, acceleration=5.0)
     still = replace(case, motion=replace(case.motion, limits=fixed, motor=None))
     for one, step, known in ((still, 1e-4, 1e-6), (case, 1e-6, 1e-4)):
