@@ -151,12 +151,16 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.result import resolve, write_run
     from ccd_casadi.codesign.run import within
     from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.kernels.compilation import ensure_compiled
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
 
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is reported before anything is written
+    of_page = () if options.no_report else ("synthesis",)  # the table of bandwidths
+    if kernels := {*problem.controller.kernels, *of_page}:
+        ensure_compiled(*sorted(kernels))  # all of them now: after the answer it would seem to hang
     folder = run_folder(options.case, options.out)
     name = options.formulation or usual_name(case, len(problem.names))
     formulation = formulation_of(case, name)

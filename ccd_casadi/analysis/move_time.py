@@ -20,7 +20,8 @@ Its gradients are by perturbation of the modes, and by one adjoint recursion for
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from ccd_casadi.lti.loop import Sampling, tustin, zoh
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array, states
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class MoveTimeOptions:
     most_rounded: float = 0.1  # of the window, for all modes together
     nothing: float = 1e-30  # share of the envelope: a mode with less has died out
     newton_steps: int = 50  # at most
+    instants: int = 3000  # of all plants of a task, at least: 3 ms, and 1 ms to hand it over
 
 
 class _Crossing:
@@ -59,13 +61,15 @@ class _Crossing:
         self.stable, self.time = bool(np.abs(self.poles).max() < 1.0), np.inf
         if not self.stable:
             return
-        driven = np.outer(r, loop.B_r[:, 0])
-        driven[:, : len(G.A)] += f @ G.B.T
-        self.x = states(loop.A, driven)  # the last at rest but for the loop's own modes
+        # x less the rest at each setpoint, which begins at 0: at the end what is left of the modes
         self.still = np.eye(len(loop.A)) - loop.A
-        self.rest = np.linalg.solve(self.still, loop.B_r[:, 0] * r[-1])
+        rest = np.linalg.solve(self.still, loop.B_r[:, 0])
+        driven = np.outer(r - np.append(r[1:], r[-1]), rest)
+        driven[:, : len(G.A)] += f @ G.B.T
+        moving = states(loop.A, driven)
+        self.rest, self.x = rest * r[-1], moving + np.outer(r, rest)
         self.W = np.linalg.inv(self.V)
-        self.c, self.b = loop.C_y[0] @ self.V, self.W @ (self.x[-1] - self.rest)
+        self.c, self.b = loop.C_y[0] @ self.V, self.W @ moving[-1]
         self.residues = -self.c * self.b
         with np.errstate(divide="ignore"):
             self.logs = np.log(np.abs(self.residues) / window), np.log(np.abs(self.poles))
@@ -109,13 +113,40 @@ class _Crossing:
         self.to_f = np.append(later[:, :n] @ self.plant.B[:, 0], 0.0)
         return self
 
-    def along(self, moved: ClosedLoop, inputs: Array | None = None) -> float:
-        """dt along the imaginary part of a loop, and of its plant's inputs where they move."""
+    def along(self, moved: ClosedLoop, inputs: Array) -> float:
+        """dt along the imaginary part of a loop, and of its plant's inputs."""
         found = np.sum(self.to_A * moved.A.imag) + self.to_C @ moved.C_y[0].imag
-        found += self.to_B @ moved.B_r[:, 0].imag
-        if inputs is not None:
-            found += self.to_input @ inputs[:, 0].imag
+        found += self.to_B @ moved.B_r[:, 0].imag + self.to_input @ inputs[:, 0].imag
         return float(found / MotionOptions().complex_step)
+
+    def along_controllers(self, moved: StateSpace) -> Array:
+        """dt (N,) along the imaginary parts of controllers A (N, k, k), B (N, k, 1), C, D.
+
+        The loop is linear in them: A = [A_p - B_p D C_p, B_p C; -B C_p, A], B_r = [B_p D; B].
+        """
+        n, B_p, C_p = len(self.plant.A), self.plant.B[:, 0], self.plant.C[0]
+        to_A = self.to_A
+        to_D = B_p @ (self.to_B[:n] - to_A[:n, :n] @ C_p)
+        found = np.tensordot(moved.A.imag, to_A[n:, n:]) + moved.D.imag[:, 0, 0] * to_D
+        found += moved.B.imag[..., 0] @ (self.to_B[n:] - to_A[n:, :n] @ C_p)
+        found += moved.C.imag[:, 0] @ (B_p @ to_A[:n, n:])
+        return np.asarray(found / MotionOptions().complex_step)
+
+
+def _cross(
+    plants: Sequence[StateSpace], K: StateSpace, r: Array, f: Array, window: float,
+    options: MoveTimeOptions,
+) -> list[_Crossing]:  # fmt: skip
+    return [_Crossing(G, K, r, f, window, K.period, options) for G in plants]
+
+
+def _times(*arguments: Any, moved: StateSpace) -> list[tuple[float, Array]]:
+    """The times of `_cross`, each with its slopes (N,) along N controllers; infinite where one of
+    the loops is unstable."""
+    found = _cross(*arguments)
+    if not all(each.stable for each in found):
+        return [(np.inf, np.full(len(moved.A), np.nan))] * len(found)
+    return [(each.time, each.with_slopes().along_controllers(moved)) for each in found]
 
 
 @dataclass(frozen=True)
@@ -145,25 +176,25 @@ class MoveTime:
     def at(self, kappa: Array, workers: Pool | None = None) -> tuple[float, Array]:
         """ln v (s) at κ in SI, and its gradient; infinite where a loop is unstable.
 
-        Workers are not used: a plant takes a millisecond.
+        Some plants at a time are spread over workers.
         """
-        kappa = np.asarray(kappa, float)
-        found = self._crossings(kappa)
-        if not all(each.stable for each in found):
-            return np.inf, np.full(len(kappa), np.nan)
+        kappa, period, count = np.asarray(kappa, float), self.hold.period, len(self.plants)
         step = 1j * MotionOptions().complex_step
         stepped = self.structure.state_spaces(kappa + step * np.eye(len(kappa)))
-        moved = [
-            tustin(StateSpace(*(part[i] for part in stepped)), self.hold.period)
-            for i in range(len(kappa))
-        ]
-        value, weights, _ = self._together(found)
+        each = [tustin(StateSpace(*parts), period) for parts in zip(*stepped, strict=True)]
+        moved = StateSpace(*(np.stack([getattr(K, part) for K in each]) for part in "ABCD"))
+        with_slopes, rest = partial(_times, moved=moved), self._arguments(kappa)
+        size = -(-count // max(1, count * len(self._time) // self.options.instants))
+        tasks = {i: (self._sampled[i : i + size], *rest) for i in range(0, count, size)}
+        found = dict(results(workers, with_slopes, tasks))
+        times, slopes = zip(*(one for i in tasks for one in found[i]), strict=True)
+        if np.inf in times:
+            return np.inf, np.full(len(kappa), np.nan)
+        value, weights, _ = self._together(times)
         gradient = np.zeros(len(kappa))
-        for weight, each in zip(weights, found, strict=True):
+        for weight, slope in zip(weights, slopes, strict=True):
             if weight > self.options.nothing:
-                back = each.with_slopes()
-                slopes = [back.along(closed_loop(back.plant, K)) for K in moved]
-                gradient += weight * np.array(slopes)
+                gradient += weight * slope
         return float(np.log(value)), gradient / value
 
     def to_theta(self, kappa: Array, workers: Pool | None = None) -> Array:
@@ -172,7 +203,7 @@ class MoveTime:
         size = MotionOptions().complex_step
         step = 1j * size
         T, tau = self.hold.period, self.hold.delay
-        value, weights, by_duration = self._together(found)
+        value, weights, by_duration = self._together([each.time for each in found])
         K = tustin(self.structure.state_space(kappa), T)
         gradient = by_duration * motion.slopes(lambda cycle: cycle.profile.durations.sum())
         signals = [
@@ -217,17 +248,18 @@ class MoveTime:
         motion = self.motion
         return forward_force(motion.cycle.profile, motion.forward, self._time, self.hold.period)
 
-    def _crossings(self, kappa: Array) -> list[_Crossing]:
-        T, motion = self.hold.period, self.motion
-        K = tustin(self.structure.state_space(kappa), T)
-        r, f = self._signals
-        window, options = motion.motion.window, self.options
-        return [_Crossing(G, K, r, f, window, T, options) for G in self._sampled]
+    def _arguments(self, kappa: Array) -> tuple[StateSpace, Array, Array, float, MoveTimeOptions]:
+        """Of `_cross`, but for the plants."""
+        K = tustin(self.structure.state_space(kappa), self.hold.period)
+        return K, *self._signals, self.motion.motion.window, self.options
 
-    def _together(self, found: Sequence[_Crossing]) -> tuple[float, Array, float]:
+    def _crossings(self, kappa: Array) -> list[_Crossing]:
+        return _cross(self._sampled, *self._arguments(kappa))
+
+    def _together(self, times: Sequence[float]) -> tuple[float, Array, float]:
         """v, ∂v/∂t_i and ∂v/∂t_0."""
         t_0, sharpness = self.motion.cycle.profile.duration, self.options.sharpness
-        late = np.array([each.time for each in found]) / t_0
+        late = np.array(times) / t_0
         top = max(1.0, float(late.max()))
         shares = np.exp(sharpness * (late - top))
         whole = np.exp(sharpness * (1.0 - top)) + shares.sum()

@@ -5,9 +5,11 @@ x = (θ, ln ω_S, ln ω_T), and the whole inner problem over (ω_S, ω_T) at a �
 they end with.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, isfinite
+from operator import call
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -36,6 +38,7 @@ from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import Design
@@ -273,7 +276,13 @@ class MixedOuter(Outer):
         # Never from a store: it cannot know all that the design depends on.
         final = final_design(problem, theta, (figures.omega_S, figures.omega_T))
         loops = loops_of(problem, theta, final.controller)
-        found, robust = judge_survival(problem, loops, final.figures)
+        tasks: dict[str, tuple[Callable[[], Any]]] = {
+            "survival": (partial(judge_survival, problem, loops, final.figures),),
+            "second": (partial(second_on_weighted, problem, theta, final),),
+            "damping": (partial(other_damping, problem, loops),),
+        }
+        judged = dict(results(sampler.workers, call, tasks))
+        found, robust = judged["survival"]
         return VerifiedDesign(
             problem=problem,
             x=x,
@@ -287,9 +296,9 @@ class MixedOuter(Outer):
             feasible=final.figures.certified and here.acceptable,
             references=check_references(problem, theta, final, sampler.workers, sampler.quiet),
             robust=robust,
-            damping=other_damping(problem, loops),
+            damping=judged["damping"],
             survival=found,
-            second=second_on_weighted(problem, theta, final),
+            second=judged["second"],
         )
 
     def point_of(self, theta: Sequence[float], weights: Weights) -> Array:

@@ -6,6 +6,7 @@ beside the samples that it determines.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -296,6 +297,11 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
     (209.2, (4, 4))
     """
+    return _scaled_plant(problem, tuple(map(float, theta)))
+
+
+@lru_cache(maxsize=1)  # a design and what is read from it later are of one plant
+def _scaled_plant(problem: CoDesignProblem, theta: tuple[float, ...]) -> ScaledPlant:
     return scaled_system(problem, mechanics(plant_of(problem), theta))
 
 

@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, Point, evaluate, refine
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.worker_process import side_by_side
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
@@ -49,7 +50,7 @@ def search_inner(
     def design(point: Array) -> Sensitivities:
         return at(problem.frequencies(bounds[:, 0] + point * width))
 
-    designs = [design(point) for point in points]
+    designs = side_by_side(design, points)
     fine = np.linspace(0.0, 1.0, options.mesh)
     for _ in range(options.added):
         usable = [i for i, design in enumerate(designs) if design.figures.certified]

@@ -41,6 +41,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.lent_pool import LentWorkers
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ
@@ -277,7 +278,9 @@ class ProblemAt:
             sampling=structured.sampling, frequencies=structured.frequencies,
             least_bandwidth=structured.bandwidth_least,
         )  # fmt: skip
-        tasks = {-1: (partial(self.search, initial),), **{i: (end,) for i, end in ends.items()}}
+        # the search is the shortest: the last, it fills what the descents leave
+        search = partial(self.search, initial, workers=LentWorkers())
+        tasks = {**{i: (end,) for i, end in ends.items()}, -1: (search,)}
         found = dict(results(workers, call, tasks))
         return found.pop(-1), {i: found[i] for i in ends}
 

@@ -24,12 +24,14 @@ from oracles.helpers import (
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.inner import main as inner
+from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 from surrogates import load
 
@@ -171,6 +173,21 @@ def test_a_run_without_a_report_has_everything_else(
     assert "report.html" in before
     assert run(folder, "--no-report", "--formulation", "lifted") == 0
     assert {path.name for path in folder.iterdir()} == before - {"report.html", "index.html"}
+
+
+@pytest.mark.parametrize(("more", "groups"), [([], {"loops", "synthesis"}),
+                                              (["--no-report"], {"loops"})])  # fmt: skip
+def test_the_kernels_of_its_pages_are_compiled_before_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: list[str], groups: set[str]
+) -> None:
+    def required_groups(*names: str) -> None:
+        assert set(names) == groups
+        raise UserError("they are known")
+
+    monkeypatch.setattr(compilation, "ensure_compiled", required_groups)
+    built = TWO_MASS.with_name("two_mass_built.toml")
+    assert main([str(built), "--out", str(tmp_path), *more]) == 2
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_second_run_reuses_every_sample(

@@ -1,12 +1,15 @@
 """The inner problem: both methods, the prototype's optimum, dense sweeps, infeasibility."""
 
+import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from oracles.chain_plants import chain_problem
 from oracles.helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
 
+from ccd_casadi.inner_problem import search
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant, true_inner
 from ccd_casadi.inner_problem.search import search_inner
@@ -14,10 +17,13 @@ from ccd_casadi.inner_problem.sweep import (
     InnerBounds,
     InnerResult,
     active_constraints,
+    evaluate,
     sweep_inner,
     sweep_starts,
 )
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.support.worker_process import threads_permitted
+from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import sweep
 
 BUDGET = 40
@@ -73,6 +79,25 @@ def test_search_finds_the_optimum_under_other_constraints(count: int) -> None:
         )
         errors.append(compare(tuple(rng.uniform(55.0, 70.0, 2)), inner))
     assert np.abs(errors).max() < 1e-6
+
+
+def test_first_designs_are_made_in_threads_and_change_no_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    places = list[str]()
+
+    def evaluate_noted(*arguments: Any) -> Sensitivities:
+        places.append(threading.current_thread().name)
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(search, "evaluate", evaluate_noted)
+    alone = search_inner(two_mass(60.0, 60.0), PAPER, INNER)
+    assert set(places) == {"MainThread"}
+    with threads_permitted(2):
+        beside = search_inner(two_mass(60.0, 60.0), PAPER, INNER)
+    assert set(places) > {"MainThread"}
+    assert beside.rows == alone.rows
+    assert beside.bandwidth == alone.bandwidth
 
 
 @pytest.mark.parametrize("method", ["search", "sweep"])

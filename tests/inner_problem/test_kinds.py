@@ -274,12 +274,3 @@ def test_the_value_on_measured_lines(tmp_path: Path) -> None:
     assert short.max() <= 1.0 + 1e-9
     assert short.max() >= 0.98 or hz[above - 1] <= found
     assert answer.figures["sensitivity_peak"] == pytest.approx(S.max(), rel=1e-9)
-
-
-def test_a_gain_of_the_set_is_named_beside_a_bound_on_the_compliance() -> None:
-    """It scales what a force moves, which an actuator's own gain does not."""
-    uncertain = Uncertainty(gain=0.05)
-    (note,) = StructuredProblem(compliance_max=1e-6, uncertainty=uncertain).notes
-    assert "1.053 times" in note
-    assert StructuredProblem(uncertainty=uncertain).notes == ()
-    assert StructuredProblem(compliance_max=1e-6).notes == ()

@@ -1,5 +1,6 @@
 """Motor and move: against analysis, against a simulation of its own, and against differences."""
 
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -45,6 +46,7 @@ from ccd_casadi.plants.plant import (
 from ccd_casadi.reporting.concerns import current_concern
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
@@ -122,6 +124,28 @@ def test_random_moves_settle_at_the_sample_of_another_simulation() -> None:
         assert smooth >= exact * (1.0 - 1e-9)
 
 
+class Backwards(Workers):
+    """This process, which does the last task first; `tasks` counts them."""
+
+    tasks = 0
+
+    def map_unordered(self, function: Callable, tasks: Sequence) -> Generator:
+        self.tasks += len(tasks)
+        yield from map(function, reversed(tasks))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3])
+def test_workers_share_its_plants_and_change_no_bit(factor: float) -> None:
+    case, workers = moves.drawn(np.random.default_rng(5)), Backwards(1)
+    goal = replace(case.goal(), plants=case.goal().plants * 20)
+    kappa = case.kappa + np.log([factor, *np.ones(len(case.kappa) - 1)])
+    there, here = goal.at(kappa, workers), goal.at(kappa)
+    assert workers.tasks > 1
+    assert there[0] == here[0]
+    assert np.isfinite(here[0]) == (factor == 1.0)  # no loop is stable with such a gain
+    np.testing.assert_array_equal(there[1], here[1])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_its_derivatives(seed: int) -> None:
     case = moves.drawn(np.random.default_rng(seed))
@@ -131,7 +155,7 @@ def test_its_derivatives(seed: int) -> None:
     value, to_kappa = goal.at(case.kappa)
     assert value >= np.log(goal.motion.cycle.profile.duration)
     numeric = slopes(lambda kappa: np.array([goal.at(kappa)[0]]), case.kappa, 5e-5)[0]
-    assert to_kappa == pytest.approx(numeric, abs=1e-6)
+    assert to_kappa == pytest.approx(numeric, abs=3e-7)  # 1.2e-7 was met
     fixed = replace(case.motion.limits, acceleration=5.0)
     still = replace(case, motion=replace(case.motion, limits=fixed, motor=None))
     for one, step, known in ((still, 1e-4, 1e-6), (case, 1e-6, 1e-4)):
