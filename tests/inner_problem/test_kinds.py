@@ -25,7 +25,7 @@ from ccd_casadi.extensions.measured.measured_answer import measured_answer
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
