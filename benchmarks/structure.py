@@ -36,7 +36,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.extensions.rib_stage.reduced": ("RIGID",),
     "ccd_casadi.cases.checks": ("LARGEST", "SMALLEST"),
     "ccd_casadi.cases.plant_findings": ("MASS", "STIFFNESS"),
-    "ccd_casadi.codesign.lifted_kkt": ("HALF_POWER",),
+    "ccd_casadi.codesign.optimality": ("HALF_POWER",),
     "ccd_casadi.codesign.result": ("FORMAT",),
     "ccd_casadi.fixed_structure.certificate_curves": ("HALF_POWER",),
     "ccd_casadi.fixed_structure.discs": ("GUARD",),
