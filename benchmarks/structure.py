@@ -66,8 +66,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.synthesis.matlab_systems": ("SECONDS",),
     "ccd_casadi.support.text": ("HZ",),
     "ccd_casadi.support.command_line": ("DIES_WITH_PARENT",),
-    "surrogates.covariance": ("ROOT5", "NO_NOISE"),
-    "surrogates.gaussian_process": ("TWO_SIDED_95",),
+    "surrogates.gaussian_process": ("ROOT5", "NO_NOISE", "TWO_SIDED_95"),
 }  # fmt: skip
 OF_NUMBERS = ("np.", "math.", "float", "int", "range", "tuple")
 SECTIONS = ("Parameters\n", "Returns\n", "Attributes\n", "Raises\n")
