@@ -22,7 +22,7 @@ from typing import Any
 from ccd_casadi.cases.case import Case, parse_case, read_toml
 from ccd_casadi.extensions.drives.drive_case import drive_problem
 from ccd_casadi.extensions.drives.drive_design import design_drive
-from ccd_casadi.extensions.drives.drive_verdict import verdict_entry
+from ccd_casadi.extensions.drives.sheet import verdict_entry
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 

@@ -36,7 +36,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.extensions.rib_stage.reduced": ("RIGID",),
     "ccd_casadi.cases.checks": ("LARGEST", "SMALLEST"),
     "ccd_casadi.cases.plant_findings": ("MASS", "STIFFNESS"),
-    "ccd_casadi.codesign.lifted_kkt": ("HALF_POWER",),
+    "ccd_casadi.codesign.optimality": ("HALF_POWER",),
     "ccd_casadi.codesign.result": ("FORMAT",),
     "ccd_casadi.fixed_structure.certificate_curves": ("HALF_POWER",),
     "ccd_casadi.fixed_structure.discs": ("GUARD",),
@@ -66,8 +66,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.synthesis.matlab_systems": ("SECONDS",),
     "ccd_casadi.support.text": ("HZ",),
     "ccd_casadi.support.command_line": ("DIES_WITH_PARENT",),
-    "surrogates.covariance": ("ROOT5", "NO_NOISE"),
-    "surrogates.gaussian_process": ("TWO_SIDED_95",),
+    "surrogates.gaussian_process": ("ROOT5", "NO_NOISE", "TWO_SIDED_95"),
 }  # fmt: skip
 OF_NUMBERS = ("np.", "math.", "float", "int", "range", "tuple")
 SECTIONS = ("Parameters\n", "Returns\n", "Attributes\n", "Raises\n")

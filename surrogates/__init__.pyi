@@ -1,6 +1,4 @@
 # What surrogates/__init__.py imports when it is first used, for editors and type checkers.
-from surrogates.covariance import Hyperparameters as Hyperparameters
-from surrogates.covariance import Kernel as Kernel
 from surrogates.estimator import SurrogateRegressor as SurrogateRegressor
 from surrogates.export import SurrogateFileError as SurrogateFileError
 from surrogates.export import load as load
@@ -9,6 +7,8 @@ from surrogates.export import to_casadi as to_casadi
 from surrogates.fitting import fit as fit
 from surrogates.fitting import fit_outputs as fit_outputs
 from surrogates.gaussian_process import GaussianProcess as GaussianProcess
+from surrogates.gaussian_process import Hyperparameters as Hyperparameters
+from surrogates.gaussian_process import Kernel as Kernel
 from surrogates.gaussian_process import condition as condition
 from surrogates.gaussian_process import loo_errors as loo_errors
 from surrogates.quality import Extrapolation as Extrapolation

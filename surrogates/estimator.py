@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from surrogates.covariance import Kernel
 from surrogates.fitting import fit
+from surrogates.gaussian_process import Kernel
 from surrogates.samples import Array
 
 

@@ -13,9 +13,8 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from surrogates.covariance import ROOT5, Kernel
 from surrogates.files import write_whole
-from surrogates.gaussian_process import GaussianProcess
+from surrogates.gaussian_process import ROOT5, GaussianProcess, Kernel
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")

@@ -7,11 +7,96 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_solve, cholesky
 
-from surrogates.covariance import Hyperparameters, Kernel, log_likelihood
-from surrogates.gaussian_process import GaussianProcess, condition_samples, loo_errors
+from surrogates.gaussian_process import (
+    NO_NOISE,
+    GaussianProcess,
+    Hyperparameters,
+    Kernel,
+    blocks,
+    condition_samples,
+    loo_errors,
+    observed_covariance,
+    radial,
+    separations,
+    symmetric_inverse,
+)
 from surrogates.samples import Array, Samples, SurrogateFitError, checked
+
+
+def blocks_weighed(W: Array, z: Array, phi: list[Array], length_scales: Array) -> Array:
+    """Sum W times the blocks of `covariance`, rows and columns of gradients in it, over these.
+
+    W is (a (1 + d), b (1 + d)) as the blocks are, or (a, b) of values alone; the sum is (a, b).
+    """
+    d, a, b = z.shape
+    if len(W) == a:
+        return np.asarray(W * phi[0])
+    V = W.reshape(1 + d, a, 1 + d, b)
+    u = 2.0 * z / length_scales[:, None, None]
+    slopes = (u * (V[1:, :, 0] - V[0, :, 1:].transpose(1, 0, 2))).sum(axis=0)
+    curved, own = np.zeros((a, b)), np.zeros((a, b))
+    for i in range(d):
+        curved += u[i] * (V[1 + i, :, 1:].transpose(1, 0, 2) * u).sum(axis=0)
+        own += (2.0 / length_scales[i] ** 2) * V[1 + i, :, 1 + i]
+    return np.asarray(V[0, :, 0] * phi[0] + (slopes - own) * phi[1] - curved * phi[2])
+
+
+def log_likelihood(
+    kernel: Kernel,
+    X: Array,
+    targets: Array,
+    parameters: Hyperparameters,
+    jitter: float = 0.0,
+    sample_noise: Array = NO_NOISE,
+) -> tuple[float, Array]:
+    """Return log p(targets | X) and its gradient in the logarithms of the parameters.
+
+    log p = -½ tᵀK⁻¹t - Σ log L_ii - N/2 log 2π and
+    ∂ log p / ∂θ = ½ tr((αα^T - K⁻¹) ∂K/∂θ), α = K⁻¹t,
+    in the order θ = log (l_1 ... l_d, σ², noise, gradient noise), shape (d + 3,).
+    X (n, d) is scaled; targets (n,) are values, or (n (1 + d),) values and gradients.
+
+    Raises:
+        LinAlgError: K is not positive definite.
+    """
+    n, d = X.shape
+    gradients = targets.size > n
+    lengths = parameters.length_scales
+    z = separations(X, X, lengths)
+    squares = z * z
+    phi = radial(kernel, squares.sum(axis=0), 3 if gradients else 1)
+    C = blocks(z, phi, lengths, gradients, gradients)
+    K = observed_covariance(C, n, parameters, jitter, sample_noise)
+    L = cholesky(K, lower=True, overwrite_a=True)
+    alpha = cho_solve((L, True), targets)
+    value = (
+        -0.5 * targets @ alpha - np.log(np.diag(L)).sum() - 0.5 * targets.size * np.log(2.0 * np.pi)
+    )
+    W = np.outer(alpha, alpha) - symmetric_inverse(L)
+
+    # K depends on log l_m in two ways. Through s, ds/dlog l_m = -2 z_m², which
+    # shifts every φ to its derivative; and through the factors 1/l of the gradient
+    # rows and columns, z_i/l_i going as l_i^-2 but the δ_ij term as l_i^-2 in all.
+    S, components = blocks_weighed(W, z, phi[1:], lengths), targets.size // n
+    slope = np.empty(d + 3)
+    slope[:d] = -np.tensordot(squares, S, axes=2)
+    WK = W * C
+    WK[np.diag_indices_from(WK)] *= 1.0 + jitter
+    if gradients:
+        # The jitter sits on the diagonal, where z = 0 and only the δ_ij term acts.
+        own = np.einsum("iaib->iab", W.reshape(components, n, components, n))[1:]
+        with_jitter = phi[1] * (1.0 + jitter * np.eye(n))
+        slope[:d] -= 2.0 * WK.sum(axis=1).reshape(components, n).sum(axis=1)[1:]
+        slope[:d] += -(2.0 / lengths**2) * np.einsum("iab,ab->i", own, with_jitter)
+    slope[:d] *= parameters.signal_variance
+    slope[d] = 0.5 * parameters.signal_variance * WK.sum()
+    W_diagonal = np.diag(W)
+    slope[d + 1] = 0.5 * parameters.noise_variance * W_diagonal[:n].sum()
+    slope[d + 2] = 0.5 * parameters.gradient_noise_variance * W_diagonal[n:].sum()
+    return float(value), slope
+
 
 Noise = ArrayLike | None
 

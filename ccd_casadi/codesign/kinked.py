@@ -14,12 +14,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import null_space
 
-from ccd_casadi.codesign.lifted_kkt import (
+from ccd_casadi.codesign.optimality import (
     LiftedKktOptions,
     TrueDesign,
+    active_at,
     first_order,
-    newton_step,
+    lagrangian_hessian,
     other_peaks,
 )
 from ccd_casadi.codesign.outer_problem import lifted_bounds
@@ -29,6 +31,37 @@ from ccd_casadi.optim.step import Iterate, Rows, Step, TrustRegionModel
 from ccd_casadi.optim.trust_region import Radius, minimise
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.time_budget import not_searched, time_is_up
+
+
+def newton_step(here: TrueDesign) -> Array | None:
+    """Return the end of a Newton step; None without a positive reduced Hessian, or where the step
+    is too long.
+
+    From a design whose certificate is of the plain conditions. The Hessian takes two true designs
+    per free direction. Nocedal and Wright, Numerical Optimization, 18.1.
+    """
+    problem, mu, at = here.problem, here.kkt.multipliers, active_at(here)
+    held = np.array([mu[name] > 0.0 for name in at.labels], bool)
+    A = at.rows[held]
+    inside = np.array([here.options.inside * (name in problem.inner.bounds) for name in at.labels])
+    aim = np.where(np.arange(held.size) < at.constraints, -(at.slack + inside), 0.0)[held]
+    Z = null_space(A)
+    if Z.shape[1] == 0:  # a vertex
+        return None
+    columns = lagrangian_hessian(here, Z, mu)
+    if columns is None:
+        return None
+    H = Z.T @ columns
+    H = 0.5 * (H + H.T)
+    if np.linalg.eigvalsh(H).min() <= 0.0:
+        return None
+    d = -Z @ np.linalg.solve(H, Z.T @ at.gradient)
+    if A.size:
+        d = d + np.linalg.lstsq(A, aim, rcond=None)[0]
+    if np.abs(d).max() > here.options.longest_newton_step:
+        return None
+    bounds = lifted_bounds(problem)
+    return np.clip(here.x + bounds.width * d, *bounds)
 
 
 @dataclass(frozen=True)

@@ -291,7 +291,7 @@ class ThetaOuter(Outer, ABC):
         with sampler.spent.on("polish"):
             best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, self.options.settled)
-        from ccd_casadi.codesign.theta_kkt import theta_kkt
+        from ccd_casadi.codesign.optimality import theta_kkt
 
         kkt = theta_kkt(problem, best, sampler)
         return PolishedDesign(
@@ -308,7 +308,7 @@ class ThetaOuter(Outer, ABC):
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
-        from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
+        from ccd_casadi.codesign.optimality import ThetaKktOptions, theta_kkt
 
         stationary = theta_kkt(problem, best).stationarity <= ThetaKktOptions().smooth
         return Place(np.array(best.theta), J, stationary)

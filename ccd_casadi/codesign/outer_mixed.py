@@ -23,7 +23,7 @@ from ccd_casadi.codesign.final_judgement import (
     second_on_weighted,
 )
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
-from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
+from ccd_casadi.codesign.optimality import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import FormulationResult, lifted_bounds
 from ccd_casadi.codesign.reasons import Finding, Reason

@@ -23,6 +23,7 @@ from ccd_casadi.codesign.final_judgement import (
     other_damping,
     second_on_set,
 )
+from ccd_casadi.codesign.optimality import theta_kkt
 from ccd_casadi.codesign.outer import Place, PolishedDesign, ThetaOuter, is_expensive, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.stored_searches import (
@@ -33,7 +34,6 @@ from ccd_casadi.codesign.stored_searches import (
 )
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
-from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.codesign.working_set import with_scenarios

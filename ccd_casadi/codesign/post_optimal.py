@@ -23,15 +23,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.lifted_kkt import (
+from ccd_casadi.codesign.optimality import (
     OTHER_PEAK,
     TrueDesign,
     active_at,
+    active_theta,
     lagrangian_hessian,
     other_peaks,
+    theta_kkt,
 )
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.theta_kkt import active_theta, theta_kkt
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import TrueQuantities

@@ -20,7 +20,7 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 from surrogates import Kernel
-from surrogates.covariance import covariance
+from surrogates.gaussian_process import covariance
 
 
 @dataclass(frozen=True)

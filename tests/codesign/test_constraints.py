@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.lifted_kkt import TrueDesign
+from ccd_casadi.codesign.optimality import TrueDesign
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.inner_problem.objective import (

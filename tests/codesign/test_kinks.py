@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
+from ccd_casadi.codesign.optimality import joint_residual, theta_kkt
 from ccd_casadi.codesign.reasons import Reason
-from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.fixed_structure.local_search import Envelope

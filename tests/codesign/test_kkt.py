@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import HZ, few, problem
 
-from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
+from ccd_casadi.codesign.optimality import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer_problem import OuterSolution, outer_program, solve_program
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource

@@ -8,8 +8,8 @@ from oracles.helpers import few, problem
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
-from ccd_casadi.codesign.kinked import polish
-from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign, active_at, newton_step
+from ccd_casadi.codesign.kinked import newton_step, polish
+from ccd_casadi.codesign.optimality import LiftedKktOptions, TrueDesign, active_at
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource

@@ -8,7 +8,7 @@ from oracles.helpers import HZ, few, problem
 from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
+from ccd_casadi.codesign.optimality import LiftedKktOptions, TrueDesign
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim import pieces as of_pieces
 from ccd_casadi.optim import quadratic_programmes

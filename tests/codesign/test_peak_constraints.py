@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import HZ, few, problem
 
-from ccd_casadi.codesign import lifted_kkt as kkt
+from ccd_casadi.codesign import optimality as kkt
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.lifted_kkt import OTHER_PEAK, TrueDesign, other_peaks
+from ccd_casadi.codesign.optimality import OTHER_PEAK, TrueDesign, other_peaks
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_search import global_check
 from ccd_casadi.inner_problem import objective

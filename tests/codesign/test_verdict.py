@@ -21,7 +21,7 @@ from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.final_judgement import judge_survival
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
-from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
+from ccd_casadi.codesign.optimality import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_mixed import VerifiedDesign
 from ccd_casadi.codesign.outer_problem import GlobalCheck, lifted_bounds
 from ccd_casadi.codesign.reasons import Reason, within_words

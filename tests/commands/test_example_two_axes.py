@@ -12,8 +12,8 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.optimality import theta_kkt
 from ccd_casadi.codesign.structured_entries import active_of, design_dict
-from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.pipeline import require_own_bounds
 from ccd_casadi.fixed_structure.design import SectionsDesign

@@ -9,12 +9,11 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case, read_toml
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.extensions.drives import drive_verdict
+from ccd_casadi.extensions.drives import sheet
 from ccd_casadi.extensions.drives.cascade_search import Candidate
 from ccd_casadi.extensions.drives.drive_case import DriveProblem, drive_problem
 from ccd_casadi.extensions.drives.drive_design import DriveDesign, judge
-from ccd_casadi.extensions.drives.drive_verdict import verdict_entry
-from ccd_casadi.extensions.drives.sheet import sheet_rows
+from ccd_casadi.extensions.drives.sheet import sheet_rows, verdict_entry
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.lti.loop import Sampling, zoh
@@ -47,7 +46,7 @@ def made(drive: DriveProblem, values: Array = SLOW, slower: int = 1) -> DriveDes
                        Excess(*points[0], -0.01), between=between)  # fmt: skip
 
 
-SURVIVAL = drive_verdict._survival
+SURVIVAL = sheet._survival
 
 
 @cache
@@ -58,7 +57,7 @@ def ranges() -> Survival:
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drive_verdict, "_survival", lambda *_: ranges())
+    monkeypatch.setattr(sheet, "_survival", lambda *_: ranges())
 
 
 def stable(drive: DriveProblem, gain: float = 1.0, late: float = 0.0) -> bool:

@@ -10,9 +10,9 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.optimality import theta_kkt
 from ccd_casadi.codesign.outer_structured import polish_structured
 from ccd_casadi.codesign.post_optimal import structured_responses
-from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value

@@ -12,8 +12,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
 from surrogates import GaussianProcess, Hyperparameters, Kernel, condition, design, fit, to_casadi
-from surrogates.covariance import radial
 from surrogates.export import radial_expression
+from surrogates.gaussian_process import radial
 
 KERNELS = pytest.mark.parametrize("kernel", list(Kernel))
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])

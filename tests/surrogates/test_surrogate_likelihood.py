@@ -11,7 +11,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from surrogates import Hyperparameters, Kernel
-from surrogates.covariance import covariance, log_likelihood, observed_covariance, radial
+from surrogates.fitting import log_likelihood
+from surrogates.gaussian_process import covariance, observed_covariance, radial
 
 
 @KERNELS

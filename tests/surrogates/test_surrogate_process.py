@@ -21,8 +21,8 @@ from surrogates import (
     loo_errors,
     quality_of,
 )
-from surrogates.covariance import covariance, observed_covariance
 from surrogates.fitting import calibrate, recalibrate
+from surrogates.gaussian_process import covariance, observed_covariance
 
 
 @KERNELS

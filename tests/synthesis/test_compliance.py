@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from oracles.helpers import HZ, problem
 
-from ccd_casadi.codesign.lifted_kkt import TrueDesign, first_order
+from ccd_casadi.codesign.optimality import TrueDesign, first_order
 from ccd_casadi.codesign.outer_problem import outer_program
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient

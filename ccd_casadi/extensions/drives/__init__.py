@@ -46,17 +46,12 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.drives.drive_case import (
         DriveCodesignOptions,
         codesign_drive,
+        codesign_words,
         drive_problem,
+        figures_of,
     )
     from ccd_casadi.extensions.drives.drive_design import DriveOptions, design_drive
-    from ccd_casadi.extensions.drives.sheet import (
-        codesign_words,
-        drive_page,
-        entry,
-        figures_of,
-        sheet_figures,
-        sheet_text,
-    )
+    from ccd_casadi.extensions.drives.sheet import drive_page, entry, sheet_figures, sheet_text
     from ccd_casadi.reporting.facts import run_name
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.json_files import write_json

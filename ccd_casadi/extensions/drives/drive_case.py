@@ -11,8 +11,9 @@ tried value by value. COBYQA (Ragonneau and Zhang, SciPy) moves the others.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import Bounds as Box
@@ -40,6 +41,7 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_p
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import Log, silent
@@ -315,3 +317,25 @@ def _design(
     cost = hardware_cost(plant_of(problem), theta)
     J = problem.w1 * cost + problem.w2 * found.bandwidth
     return DriveAt(theta, cost, J, found, search.mass)
+
+
+def named_theta(problem: DriveProblem, theta: Sequence[float]) -> dict[str, float]:
+    """θ by name, in the case's units."""
+    return dict(zip(problem.problem.names, theta, strict=True))
+
+
+def figures_of(problem: DriveProblem, at: DriveAt) -> dict[str, Any]:
+    """Write the figures of a θ before rounding."""
+    return {"theta": named_theta(problem, at.theta), "bandwidth_hz": at.candidate.bandwidth / HZ,
+            "hardware_cost": at.cost, "objective": at.objective}  # fmt: skip
+
+
+def codesign_words(problem: DriveProblem, entry: Mapping[str, Any]) -> str:
+    """Both designs of a co-design, a line each."""
+    units = problem.problem.parameter_units
+    return "\n".join(
+        f"{name:14s}J {number(one['objective'], 5)}, {number(one['bandwidth_hz'], 4)} Hz, cost "
+        f"{number(one['hardware_cost'], 4)} {problem.problem.cost_unit}".rstrip()
+        + f" at {theta_words({'theta': one['theta'], 'units': units})}"
+        for name, one in entry.items()
+    )
