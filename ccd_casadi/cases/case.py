@@ -103,6 +103,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
         raise fail(f"line {line} is not UTF-8 text; save the file as UTF-8") from None
+    except IsADirectoryError:
+        raise fail(f"is a folder; name a case file in it, such as {path / 'case.toml'}") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise fail(f"cannot be read: {reason}; name a readable file") from None

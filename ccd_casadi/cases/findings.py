@@ -14,7 +14,7 @@ import numpy as np
 
 from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.plant_facts import PlantFacts
@@ -251,7 +251,7 @@ def plausibility_findings(
     """Ask about a motor, a move and S_low of a problem that hardly any machine has; facts at the
     start.
     """
-    words = _low_words(problem, facts, options)
+    words = [*_low_words(problem, facts, options), *_compliance_words(problem, facts)]
     if (motion := problem.source.motion) is not None:
         words += [*_motor_words(problem, motion, facts, options)]
         words += [*_move_words(problem, motion, options)]
@@ -310,6 +310,23 @@ def _move_words(
             f"{limits.stroke:g}, so that nothing has to move: is one in another unit?"
         )
     return words
+
+
+def _compliance_words(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
+    """A bound of what a newton moves that holds without a controller."""
+    most, low = kind_of(problem).bounds().compliance_max, problem.inner.omega_low
+    own = plant_of(problem).ports  # then other forces or places count
+    if most is None or own or not np.isfinite(facts.inertia) or not is_force(problem.spoken[1]):
+        return []
+    free = 1.0 / (facts.inertia * low**2)
+    if not most > free:
+        return []
+    bound = spoken(f"{most:.4g} m/N")
+    return [
+        f"inner.compliance_max = {most:g}: {bound} bounds nothing, since {spoken('1 N')} moves the "
+        f"free mass by {free:.2g} {spoken('m')} at omega_low_hz: was {most:g} {spoken('µm/N')} "
+        f"meant? Then write {1e-6 * most:g}"
+    ]
 
 
 def _low_words(

@@ -42,7 +42,8 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     """[plant], files in it as absolute paths."""
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
-        raise fail("plant", "give either model or function, and not both")
+        has = "has neither" if model is None else "has both"
+        raise fail("plant", f"{has} model and function; give either model or function")
     known = model_named(model) if isinstance(model, str) else None
     if known is None and isinstance(model, str) and model in extensions.SHIPPED["plants"]:
         raise fail("plant.model", extensions.missing(short_repr(model), "plants", model))

@@ -106,8 +106,8 @@ class Reason(Enum):
     )
     MULTISTART = "a multi-start search at this theta ended at {local_optima_hz:distinct} Hz"
     MULTISTART_OF = (
-        "a multi-start search at this theta ended at {local_optima_hz:distinct} Hz, from there at "
-        "{value_shown}"
+        "a multi-start search for bandwidth at this theta ended at {local_optima_hz:distinct} Hz; "
+        "from there the search of this figure ended at {value_shown}"
     )
     GAP_UNKNOWN = "gap not known"
     NO_GAP = "no bound on every controller, gap not known"

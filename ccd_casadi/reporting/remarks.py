@@ -68,9 +68,10 @@ def _without_margin(result: Mapping[str, Any], options: RemarkOptions) -> Iterat
         if one["required"] == 0.0 and one["evidence"] == Evidence.JUDGED
     ]  # fmt: skip
     if of_theta:
-        bind = "constraint binds" if len(of_theta) == 1 else "constraints bind"
-        names = _listed([f"“{name}”" for name in of_theta])
-        yield f"The {bind}: {names}; round theta to the side that keeps this."
+        what = "constraint {} binds: round theta so that it still holds."
+        if len(of_theta) > 1:
+            what = "constraints {} bind: round theta so that they still hold."
+        yield f"The {what.format(_listed([f'“{name}”' for name in of_theta]))}"
 
 
 def _worst_move(result: Mapping[str, Any], options: RemarkOptions) -> Iterator[str]:

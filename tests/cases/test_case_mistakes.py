@@ -68,7 +68,7 @@ MISTAKES: list[tuple[str, Any, str, str]] = [
     ("theta.m2", DROP, "theta.m2", "add a table [theta.m2]"),
     # plant
     ("plant.model", DROP, "plant", "give either model or function"),
-    ("plant.function", "p.py:f", "plant", "and not both"),
+    ("plant.function", "p.py:f", "plant", "has both model and function"),
     ("plant.model", "two_mas", "plant.model", "did you mean two_mass?"),
     ("plant.zetta", 0.01, "plant.zetta", "did you mean zeta?"),
     ("plant.zeta", "0.01", "plant.zeta", "give a number between 0 and 1"),
@@ -180,7 +180,7 @@ def test_a_broken_file_is_reported_with_the_place(
     ("name", "words"),
     [
         ("nowhere.toml", "there is no such file; name a case file"),
-        (".", "Is a directory; name a readable file"),
+        (".", "is a folder; name a case file in it, such as /"),
         ("a_file/x.toml", "Not a directory; name a readable file"),
         ("a\0b.toml", "name a readable file"),
         ("a\nb.toml", "there is no such file; name a case file"),

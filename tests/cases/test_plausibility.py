@@ -119,3 +119,11 @@ def test_no_mass_is_moved_by_what_is_not_a_force(unit: str, M_K: float) -> None:
     undeclared = [text for text in words if "that an actuator feels" in text or text == words[0]]
     assert all(("if its input is in N" in text) == (unit == "N") for text in undeclared)
     assert found["size"]  # the resonance and M_K stay
+
+
+def test_a_bound_of_the_compliance_that_bounds_nothing_is_asked_about(tmp_path: Path) -> None:
+    """In µm/N; as shipped, 20 µm/N, there is no question."""
+    assert questions(axis(tmp_path)) == []
+    (words,) = questions(axis(tmp_path, ("compliance_max = 2e-5", "compliance_max = 20.0")))
+    assert "compliance_max = 20: 20 m/N bounds nothing" in words
+    assert words.endswith("Then write 2e-05")

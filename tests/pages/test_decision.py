@@ -189,7 +189,7 @@ def test_a_decision_names_bounds_of_theta_and_what_another_plant_or_rounding_exc
     result["requirements"] = [requirement("S_max", 1.75, "searched", margin=0.02)]
     assert advice(result) == "Build this."
     result["requirements"] = [requirement("too heavy", 0.0, "judged")]
-    assert "“too heavy”; round theta to the side that keeps this" in advice(result)
+    assert "“too heavy” binds: round theta so that it still holds" in advice(result)
     assert "too heavy" not in advice(result | {"verdict": result_of(survives="failed")["verdict"]})
 
 

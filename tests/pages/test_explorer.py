@@ -135,8 +135,7 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     assert abs(c.step[-1] - 1.0) < 0.05
     assert c.move.feedforward
     assert (
-        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
-        < 1e-2 * np.abs(c.move.error).max()
+        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max() < 1e-2 * c.move.window
     )
 
 

@@ -56,7 +56,7 @@ def test_a_wrong_file_is_refused(
 
 
 def test_a_folder_for_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "name a readable file" in refusal([str(tmp_path)], capsys)
+    assert "is a folder; name a case file in it" in refusal([str(tmp_path)], capsys)
     assert "name a readable file" in refusal([str(TWO_MASS / "x.toml")], capsys)
 
 
