@@ -223,13 +223,13 @@ def least_value(
     if not isinstance(structure, Structure):
         raise ValueError("the least value is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
-    search = DesignSearch(problem, plants, sampling)
+    near = workers if isinstance(workers, Workers) else None  # a cluster is too far for a plant
+    search = DesignSearch(problem, plants, sampling, workers=near)
     w0 = problem.plants.omega_0
     floor = _floor(problem, least_bandwidth, options)
     descent = _Descent(problem, goal, options.reward, floor)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
-    near = workers if isinstance(workers, Workers) else None  # a cluster is too far for a plant
     first = float(np.exp(goal.at(design.kappa, near)[0]))
     best = LeastValue(design, first, first, 0, None)
     steps, known = 0, list[Array]()

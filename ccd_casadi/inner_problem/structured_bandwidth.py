@@ -270,7 +270,7 @@ class ProblemAt:
         problem, structured, structure = (
             self.problem, structured_of(self.problem), structure_of(self.problem)
         )  # fmt: skip
-        if problem.figure is BANDWIDTH or len(self.error_starts) < 2:
+        if problem.figure is BANDWIDTH or not self.error_starts:
             return self.search(initial, workers=workers), None
         assert isinstance(structure, Structure)
         ends = first_descents(

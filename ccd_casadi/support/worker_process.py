@@ -95,18 +95,21 @@ def threads_permitted(count: int) -> Iterator[None]:
         _permitted.pop()
 
 
+_BESIDE = "side_by_side"  # begins the names of these threads
+
+
 @cache
 def _threads(count: int) -> "ThreadPoolExecutor":
     """They last: what a thread made it may have to free."""
     from concurrent.futures import ThreadPoolExecutor
 
-    return ThreadPoolExecutor(count, "side_by_side")
+    return ThreadPoolExecutor(count, _BESIDE)
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Evaluate [function(item), ...] in threads, in the items' order: give the longest ones first.
 
-    Not from within `function`: its threads would wait for each other.
+    From within `function` it evaluates them one after the other: no thread waits for another.
 
     Parameters
     ----------
@@ -125,7 +128,7 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """
     todo = list(items)
     count = min(_permitted[-1], len(todo))
-    if count <= 1:
+    if count <= 1 or threading.current_thread().name.startswith(_BESIDE):
         return [function(item) for item in todo]
     return list(_threads(count).map(function, todo))
 

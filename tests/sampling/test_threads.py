@@ -53,6 +53,22 @@ def test_what_its_own_thread_lets_go_is_freed_at_once() -> None:
     assert len(Made.threads) == 2
 
 
+def test_threads_inside_threads_do_not_wait_for_each_other() -> None:
+    with threads_permitted(2):
+        meet = threading.Barrier(2)
+
+        def outer(i: int) -> list[int]:
+            meet.wait(30.0)  # both threads are taken
+            return side_by_side(abs, [i, -i])
+
+        whole = alongside(lambda: side_by_side(outer, [1, 2]))
+        ended = threading.Thread(target=whole, daemon=True)
+        ended.start()
+        ended.join(30.0)
+        assert not ended.is_alive()
+    assert whole() == [[1, 1], [2, 2]]
+
+
 def resident_pages() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1])
 

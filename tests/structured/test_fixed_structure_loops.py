@@ -25,6 +25,7 @@ from ccd_casadi.fixed_structure.certificate_curves import grid_through
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import (
     Brackets,
+    PeakOptions,
     assess,
     constraints,
     evaluate_rows,
@@ -40,6 +41,7 @@ from ccd_casadi.lti.loop import Sampling, in_w, zoh
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.worker_process import threads_permitted
 
 STRUCTURES = [
     Structure(),
@@ -163,6 +165,24 @@ def test_peaks_are_the_suprema_of_dense_grids(
             assert found.value[own].max() >= values.max() - 1e-9
             if not short.get(curve, True):
                 assert found.value[own].max() <= values.max() + 1e-2
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_halves_of_the_plants_in_threads_change_no_bit(count: int) -> None:
+    shifts = tuple(0.02 * i for i in range(count))
+    problem, kappa = loop(3, Structure(), FAST, shifts)
+    with threads_permitted(2):
+        ways = (PeakOptions(halved=1), PeakOptions(halved=10**9))
+        found = [assess(problem, kappa, -2.0, options=way) for way in ways]
+    (a, b), near = (one.peaks for one in found), [one.near for one in found]
+    assert a is not None
+    assert b is not None
+    assert near[0] is not None
+    assert near[1] is not None
+    assert len(a.value) > count
+    for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    np.testing.assert_array_equal(near[0].v, near[1].v)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, SLOW, LATE])
