@@ -41,8 +41,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.lent_pool import LentWorkers
-from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.process_pool import LentWorkers, Pool, results
 from ccd_casadi.support.terminal import Log, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
