@@ -25,13 +25,13 @@ direction left its two sides are all that there is, of several directions some a
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from scipy.linalg import qr
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.fixed_structure.local_search import Envelope
 from ccd_casadi.inner_problem.objective import (
     TrueQuantities,
     constraint_sizes,
@@ -59,6 +59,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import LocalPeak, Sensitivities, local_peaks_with_gradients
 
+if TYPE_CHECKING:
+    from ccd_casadi.fixed_structure.local_search import Envelope
+
 Beside = Callable[[Array], Array]
 
 
@@ -77,7 +80,7 @@ def theta_kkt(
     problem: CoDesignProblem,
     sample: InnerSample,
     truth: Sampler | None = None,
-    envelope: Envelope | None = None,
+    envelope: "Envelope | None" = None,
     beside: Beside | None = None,
     options: ThetaKktOptions = ThetaKktOptions(),
 ) -> KktCertificate:
@@ -139,7 +142,7 @@ def active_theta(problem: CoDesignProblem, sample: InnerSample) -> ActiveSet:
 
 
 def joint_residual(
-    envelope: Envelope, direct: Array, to_theta: Array, A: Array, size: float,
+    envelope: "Envelope", direct: Array, to_theta: Array, A: Array, size: float,
     options: ThetaKktOptions = ThetaKktOptions(),
 ) -> tuple[float, Array, Array]:  # fmt: skip
     """The residual over θ and controller with the best μ and ν, and these.

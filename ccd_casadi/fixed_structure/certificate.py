@@ -7,7 +7,7 @@ stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids thro
 zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. Of
 every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raise_tops`). A
 sampled loop is judged in z, its hold and delay exact, K by Tustin's rule (S between the samples:
-`lti.between_samples`). Its GS and weighted KS and T are products of functions of z and of s, which
+`lti.norms`). Its GS and weighted KS and T are products of functions of z and of s, which
 no Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
 GS of a wired plant is S times its mechanics, of a force on these, and known there too; where
 forces act elsewhere or something else counts it is theirs, of a continuous loop by its states.

@@ -5,7 +5,7 @@ on the eigenvalues λ = ω². Their derivatives follow from divided differences,
 
     dh(Λ)_ij = h[λ_i, λ_j] dΛ_ij    (Daleckii and Krein),
 
-which is exact at double eigenvalues too. Rigid is what K does not resist (`rigid_modes`): poles at
+which is exact at double eigenvalues too. Rigid is what K does not resist (`as_written`): poles at
 zero. A motion that K drives away has λ < 0 and poles ±√-λ; a damping ratio says nothing of it and
 damps none. On the axis poles would make the mixed-sensitivity problem singular, so that a synthesis
 has a suspension that puts those at zero at (ω_r, ζ_r), and where a flexible mode is not damped all
@@ -57,7 +57,7 @@ class Suspension:
     damping_ratio : float
         Damping ratio.
     rigid_modes : int, optional
-        Number of rigid-body modes, where the case states it; see `rigid_modes.natural_modes`.
+        Number of rigid-body modes, where the case states it; see `as_written.natural_modes`.
     undamped : float
         ζ_u, the damping ratio that flexible modes lose where one is not damped.
     """
@@ -272,7 +272,7 @@ def _of_states(system: Mechanics, held: Suspension, off: Perturbation) -> ModalP
 def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     """Remove rigid-body motions that are neither driven nor measured.
 
-    The derivatives of the plant's response do not change; see `rigid_modes.driven_and_measured`.
+    The derivatives of the plant's response do not change; see `as_written.driven_and_measured`.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class SetFeedforward:
     limits: ForceLimits  # what the inverse needs
     heat: float  # N² s, the largest of all plants, those that judge too
     peak: float  # N, the same
-    contraction: float  # ρ of `move_responses`, of the design's plants
+    contraction: float  # ρ of `coefficients`, of the design's plants
 
     @property
     def latest(self) -> float:

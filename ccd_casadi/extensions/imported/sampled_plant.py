@@ -316,7 +316,7 @@ def sampled_matrices(
     rigid_below_hz: float = 0.1, frequency_error: float = AcceptanceOptions.frequency_error,
     response_error: float = AcceptanceOptions.response_error,
 ) -> Plant:  # fmt: skip
-    """Interpolate the plant between M and K given as files (see `matrices`), reduced to modes.
+    """Interpolate the plant between M and K given as files (`reduced_table`), reduced to modes.
 
     Parameters
     ----------
