@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ccd_casadi.codesign.requirements import Evidence
+from ccd_casadi.reporting.concerns import open_bound
 from ccd_casadi.support.text import plural, with_unit
 
 
@@ -58,7 +59,7 @@ def _without_margin(result: Mapping[str, Any], options: RemarkOptions) -> Iterat
         if one["margin"] is not None and one["margin"] < options.left
     ]  # fmt: skip
     searched = [one["name"] for one in tight if one["evidence"] == Evidence.SEARCHED]
-    if searched:
+    if searched and not open_bound(result).words:  # which states how far they are proven
         yield (
             f"Nothing is left of {_listed(searched)} on the plants that were checked: another "
             "plant of the [robust] set may exceed it."
