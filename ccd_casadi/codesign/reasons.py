@@ -168,7 +168,7 @@ class Reason(Enum):
     )
     ON_PLANTS = "on {plants:count plant} checked of the [robust] set"
     PROOF = "{words}"
-    DRAWN = "{words}"
+    DRAWN = "of the [robust] set {words}"
     OTHER_DAMPING = "{words}"
     WORST_FOUND = "worst plant that a search found: {percent:.6g} % of a bound"
     NOT_ALONG = "the [robust] set is not kept all along its common resonance shift"

@@ -203,8 +203,8 @@ def requirement(name: str, required: float, evidence: str, margin: float = 1e-9)
 
 
 @pytest.mark.parametrize(
-    ("latest", "said"), [(0.283, "after 283 ms on the worst of 5 plants"), (0.1051, ""),
-                         (None, "on the worst of 5 plants of the set not")],
+    ("latest", "said"), [(0.283, "after 283 ms on the worst of the 5 plants"), (0.1051, ""),
+                         (None, "on the worst of the 5 plants that it is designed on not")],
 )  # fmt: skip
 def test_a_decision_names_the_move_on_the_worst_plant_beside_the_models(
     latest: float | None, said: str
