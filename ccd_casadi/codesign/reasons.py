@@ -95,7 +95,7 @@ class Reason(Enum):
         "KKT residual {kkt_residual:.2g} over theta and the controller together "
         "({kkt_residual_one_gradient:.2g} by the gradient of one side)"
     )
-    NOT_CHALLENGED = "the search at this theta that was to challenge it found nothing"
+    NOT_CHALLENGED = "the second search for a controller at this theta found none to compare with"
     STARTED = "{tried}"
     NO_GLOBAL_CHECK = "{tried}, no global check over the box"
     NONE_BETTER = "{tried}, none better at {checked_at}"
@@ -168,7 +168,7 @@ class Reason(Enum):
     )
     ON_PLANTS = "on {plants:count plant} checked of the [robust] set"
     PROOF = "{words}"
-    DRAWN = "{words}"
+    DRAWN = "of the [robust] set {words}"
     OTHER_DAMPING = "{words}"
     WORST_FOUND = "worst plant that a search found: {percent:.6g} % of a bound"
     NOT_ALONG = "the [robust] set is not kept all along its common resonance shift"

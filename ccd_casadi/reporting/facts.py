@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import UndefinedError
 
 from ccd_casadi.analysis import MOTOR_LIMITS
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -200,6 +201,9 @@ def requirement_words(
         small = required == 0.0 and abs(value) < least
         return "0" if small else f"{factor * value:.{digits}g} {unit}".strip()
 
+    if one["name"] in MOTOR_LIMITS:  # λ is the share of what the motor allows, less 1
+        share = "not known" if achieved is None else f"{100.0 + 100.0 * achieved:.4g} %"
+        return "at most 100 % of the motor's", share
     limit = shown(required) if required else "at most 0"
     return limit, "not known" if achieved is None else shown(achieved)
 
@@ -271,9 +275,10 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
     -------
     str
     """
-    if r["formulation"] == "direct":
+    line = r.get("verdict", {}).get("predicted", {})
+    if r["formulation"] == "direct" or line.get("state") == State.UNKNOWN:
         return ""
-    if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
+    if line.get("left_out") is not None:
         return "not a prediction: the surrogate was fitted with this design"
     return f"predicted {guess} (error {small_share(r['verification_error'])})"
 

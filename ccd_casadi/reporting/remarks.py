@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ccd_casadi.codesign.requirements import Evidence
-from ccd_casadi.support.text import plural, with_unit
+from ccd_casadi.reporting.concerns import open_bound
+from ccd_casadi.support.text import with_unit
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ def _without_margin(result: Mapping[str, Any], options: RemarkOptions) -> Iterat
         if one["margin"] is not None and one["margin"] < options.left
     ]  # fmt: skip
     searched = [one["name"] for one in tight if one["evidence"] == Evidence.SEARCHED]
-    if searched:
+    if searched and not open_bound(result).words:  # which states how far they are proven
         yield (
             f"Nothing is left of {_listed(searched)} on the plants that were checked: another "
             "plant of the [robust] set may exceed it."
@@ -78,12 +79,13 @@ def _worst_move(result: Mapping[str, Any], options: RemarkOptions) -> Iterator[s
     move = result.get("move") or {}
     if move.get("plants", 1) < 2 or move.get("settled") is None:
         return
-    own, latest, plants = move["settled"], move["settled_latest"], plural(move["plants"], "plant")
+    own, latest = move["settled"], move["settled_latest"]
+    worst = f"on the worst of the {move['plants']} plants that it is designed on"
     words = f"The move settles after {with_unit(own, 's')} on the model"
     if latest is None:
-        yield f"{words}, and on the worst of {plants} of the set not while it was followed."
+        yield f"{words}, and {worst} not while it was followed."
     elif latest > options.later * own:
-        yield f"{words}, and after {with_unit(latest, 's')} on the worst of {plants} of the set."
+        yield f"{words}, and after {with_unit(latest, 's')} {worst}."
 
 
 def _listed(names: list[str]) -> str:

@@ -186,6 +186,11 @@ def test_a_decision_names_bounds_of_theta_and_what_another_plant_or_rounding_exc
     result |= {"active": [], "requirements": [requirement("S_max", 1.75, "searched")]}
     assert "Nothing is left of S_max on the plants that were checked" in advice(result)
     assert decide(result).build is Build.YES
+    little = {"set": OwnSet.UNPROVEN, "proof": "looser", "proven": {"S_MAX": 1.002}, "plants": 9}
+    result["verdict"]["survives"] |= {"state": "warned"} | little
+    assert "proven only up to 0.2 %" in advice(result)
+    assert "Nothing is left" not in advice(result)
+    result["verdict"] = result_of()["verdict"]
     result["requirements"] = [requirement("S_max", 1.75, "searched", margin=0.02)]
     assert advice(result) == "Build this."
     result["requirements"] = [requirement("too heavy", 0.0, "judged")]
@@ -198,8 +203,8 @@ def requirement(name: str, required: float, evidence: str, margin: float = 1e-9)
 
 
 @pytest.mark.parametrize(
-    ("latest", "said"), [(0.283, "after 283 ms on the worst of 5 plants"), (0.1051, ""),
-                         (None, "on the worst of 5 plants of the set not")],
+    ("latest", "said"), [(0.283, "after 283 ms on the worst of the 5 plants"), (0.1051, ""),
+                         (None, "on the worst of the 5 plants that it is designed on not")],
 )  # fmt: skip
 def test_a_decision_names_the_move_on_the_worst_plant_beside_the_models(
     latest: float | None, said: str

@@ -27,7 +27,13 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.concerns import LINES
 from ccd_casadi.reporting.decision import advice
-from ccd_casadi.reporting.facts import facts, theta_table, theta_words
+from ccd_casadi.reporting.facts import (
+    facts,
+    prediction_words,
+    requirement_words,
+    theta_table,
+    theta_words,
+)
 from ccd_casadi.reporting.gain_figures import above
 from ccd_casadi.reporting.insight_page import front_answer
 from ccd_casadi.reporting.landscape import history_blocks
@@ -123,7 +129,7 @@ def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended["time_budget"]["share"] = 0.6
     words = advice(ended)
     assert words.startswith(
-        "Build this only if you accept: the search was ended by its 60 % of the budget of 5"
+        "Build this only if you accept: the search was ended at 60 % of its budget of 5"
     )
     assert "a larger --budget" in words
     within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
@@ -435,3 +441,16 @@ def test_every_part_of_the_words_is_said_somewhere() -> None:
             inside = len(re.findall(rf"\b{macro}\(", words)) > 1
             said = rf'"{name}\.{macro}"|\b(facts|_words)\([^)]*"{macro}"'
             assert inside or re.search(said, code), f"{name}.{macro}"
+
+
+def test_what_was_not_predicted_is_not_shown_as_predicted() -> None:
+    """A search on true values, as one that its budget ended, has no prediction to report."""
+    result = result_of()
+    assert prediction_words(result, "72 Hz").startswith("predicted 72 Hz")
+    assert prediction_words(result_of(predicted="unknown"), "72 Hz") == ""
+    assert prediction_words(result | {"formulation": "direct"}, "72 Hz") == ""
+
+
+def test_a_limit_of_the_motor_is_shown_as_its_share() -> None:
+    one = {"name": "peak force", "required": 0.0, "achieved": -0.3}
+    assert requirement_words(one) == ("at most 100 % of the motor's", "70 %")
