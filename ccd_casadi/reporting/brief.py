@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,7 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
     """The page as a document of its own, without scripts or requests."""
     result, problem = run.result, run.problem
     decided = decide(result)
-    decision = decided.words or "Not judged."
+    decision = replace(decided, steps=()).words or "Not judged."  # the steps end the page
     clear = decided.build is Build.YES and not decided.condition
     colour = "bad" if decided.refuses else "good" if clear else "warn"
     view = run_view(run)

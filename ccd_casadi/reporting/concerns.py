@@ -68,6 +68,7 @@ class ConcernOptions:
     overshoot: float = 0.5  # of a step without feedforward
     between_lines: float = 1.1  # what |S| may reach between lines, over the largest on them
     identified: float = 0.05  # relative: how well resonances are known where nothing else is stated
+    closed: float = 1e-3  # relative: above a bound, what counts as its proof
     open_by: float = 0.05  # relative: up to which a proof that did not close is worth its figure
 
 
@@ -232,7 +233,7 @@ def why_unproven(result: Mapping[str, Any]) -> str | None:
 
 @dataclass(frozen=True)
 class OpenBound:
-    """What a proof over a set leaves open of its worst bound, in words; empty where it is much."""
+    """What a proof over a set leaves open of its bounds, in words; empty where it is much."""
 
     words: str = ""
     remedy: str = ""
@@ -241,7 +242,7 @@ class OpenBound:
 def open_bound(
     result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
 ) -> OpenBound:
-    """Describe by how much the proof over the [robust] set misses a bound, and what closes it.
+    """Describe by how much the proof over the [robust] set misses bounds, and what closes it.
 
     A bound that is stated tighter by that share ends with a proof of the one that is needed: the
     search ends at its bounds, and the proof as far above them.
@@ -260,19 +261,22 @@ def open_bound(
     line = result.get("verdict", {}).get("survives", {})
     levels = {key: math.inf if level is None else level
               for key, level in (line.get("proven") or {}).items()}  # fmt: skip
-    name = max(levels, key=levels.__getitem__, default="")
-    over = levels.get(name, math.inf) - 1.0
+    over = max(levels.values(), default=math.inf) - 1.0
     if line.get("proof") != "looser" or not 0.0 < over <= options.open_by:
         return OpenBound()
     share = f"{math.ceil(1e5 * over - 1e-6) / 1e3:g} %"  # never less than it is
-    bound = key_words(name)
+    least = min(1.0 + options.closed, max(levels.values()))
+    above = [name for name, level in levels.items() if level >= least]
+    many = len(above) > 1
     words = (
-        f"on the whole [robust] set {bound} is proven only up to {share} above its bound (the "
+        f"on the whole [robust] set {', '.join(map(key_words, above))} {'are' if many else 'is'} "
+        f"proven only up to {share} above {'their bounds' if many else 'its bound'} (the "
         f"{plural(line['plants'], 'plant')} checked of it keep their bounds)"
     )
     accept = f"accept these {share}"
-    if kind_and_channel(name)[0] in TIGHTENED:
-        accept += f", or state {bound} {share} tighter than you need it"
+    keys = [key_words(name) for name in above if kind_and_channel(name)[0] in TIGHTENED]
+    if keys:
+        accept += f", or state {', '.join(keys)} {share} tighter than you need"
     return OpenBound(words, f"{accept}; a smaller [robust] set needs fewer boxes of the proof")
 
 
