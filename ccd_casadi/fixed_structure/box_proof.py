@@ -333,14 +333,11 @@ class Proof:
         left = (self.unproven,) if self.left else ()
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
-            over = [
-                key_words(name)
-                for name, level in self.levels.items()
-                if not level <= 1.0 + self.slack
-            ]
+            over = [f"{key_words(name)} below {level:.5g}" for name, level in self.levels.items()
+                    if not level <= 1.0 + self.slack]  # fmt: skip
             whose = "its bound" if len(over) == 1 else "their bounds"
             return (
-                f"not every bound is proven: {', '.join(over)} only below {worst:.5g} of {whose}",
+                f"not every bound is proven: only {', '.join(over)} of {whose}",
                 f"stable on the whole box by {self.boxes} enclosures",
                 *left,
             )

@@ -172,6 +172,7 @@ class SensorFamily(LoopFamily):
         lowest = np.where(good & np.isfinite(least) & (not at_rest), least, 0.0)
         moved = np.max([figure[2] for figure in figures], axis=0)
         spread = self._spread(held, finite, moved, at_actuator)
+        self._add_strength(spread, names, highest, boxes, np.ones(len(finite)))
         return Enclosures(names, highest, lowest, spread, good)
 
     def _numbers(

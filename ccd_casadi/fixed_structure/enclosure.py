@@ -13,6 +13,7 @@ K̂ = yK is finite at 0 Hz. Free bodies are infinite there, and far above all el
 set of plants, no pole crosses it: they are all stable or none is (zero exclusion).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -194,6 +195,8 @@ class LoopFamily:
         of = np.array([name if name in figures else "S" for name in names])
         several = figures if len(self.outputs) > 1 or self.plant.counted is not None else {}
         spread = loop.spread(of[np.argmax(highest, axis=0)], several)
+        size = figures["GS"].upper if several and compliance is not None else 1.0 / loop.w
+        self._add_strength(spread, names, highest, boxes, np.where(loop.good, size, 1.0))
         return Enclosures(names, highest, lowest, spread, loop.good)
 
     def _loop_discs(self, boxes: Boxes) -> LoopDiscs:
@@ -349,6 +352,7 @@ class LoopFamily:
         wide = ~good & ((r * weight).sum(axis=1) > self.options.wide_discs * norm(M))
         spread[0] += np.where(wide, delta, delta + spread.sum(axis=0) + 1e-300)
         names = tuple(name for name, *_ in found)
+        self._add_strength(spread, names, highest, boxes, total)
         return Enclosures(names, highest, np.zeros_like(highest), spread, good)
 
     @property
@@ -413,6 +417,19 @@ class LoopFamily:
             return one, one
         row = 1 + self.names.index("gain")
         return (1.0 + boxes.low[row]) * (1.0 - GUARD), (1.0 + boxes.high[row]) * (1.0 + GUARD)
+
+    def _add_strength(
+        self, spread: Array, names: Sequence[str], highest: Array, boxes: Boxes, size: Array,
+        times: float = 2.0,
+    ) -> None:  # fmt: skip
+        """Count p_gain as often more (`times`) where GS is furthest above its bound: G and 1/M are
+        enclosed apart, and so is the strength. `size`: of what spreads are measured on."""
+        if "gain" not in self.names or "GS" not in names:
+            return
+        least, most = self._strength(boxes)
+        worst = np.argmax(highest, axis=0) == list(names).index("GS")
+        moved = times * 0.5 * (most - least) / least * size
+        spread[1 + self.names.index("gain")] += np.where(worst, moved, 0.0)
 
     def _of_S(self, boxes: Boxes, S: Range, a2: Array) -> list[tuple[str, Array, Array]]:
         """(name, figure over its bound at most, at least) of every bound on S; ‖S/y‖ <= `a2`.

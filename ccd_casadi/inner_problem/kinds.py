@@ -172,7 +172,8 @@ def loop_on(problem: CoDesignProblem, plant: StateSpace, controller: StateSpace)
     p, m = controller.B.shape[1], len(controller.C)
     if plant.D.shape == (p, m):
         body = plant.mechanics if isinstance(plant, ForcedPlant) else plant
-        return found if np.array_equal(body.B, plant.B) else replace(found, drive=body.B)
+        beside = body.A.shape != plant.A.shape or np.array_equal(body.B, plant.B)
+        return found if beside else replace(found, drive=body.B)
     own, counted, force = plant.C[:p], plant.C[p:], None
     if problem.source.wiring.actuator:
         counted, force = counted[:-m], counted[-m:]

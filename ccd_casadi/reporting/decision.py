@@ -172,8 +172,9 @@ def decide(result: Mapping[str, Any]) -> Decision:
     concerns = [*missed, *weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
-        share = f"at {100.0 * budget['share']:.3g} % of" if "share" in budget else "by"
-        words = f"the search was ended {share} its budget of {budget['minutes']:g} min"
+        words = f"the search was ended by its budget of {budget['minutes']:g} min"
+        if "share" in budget:
+            words += f" ({100.0 * budget['share']:.3g} % of it are for the search)"
         concerns.append(Concern(ConcernKind.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"

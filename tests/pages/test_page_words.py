@@ -129,7 +129,7 @@ def test_a_search_that_its_budget_ended_is_named_in_the_decision() -> None:
     ended["time_budget"]["share"] = 0.6
     words = advice(ended)
     assert words.startswith(
-        "Build this only if you accept: the search was ended at 60 % of its budget of 5"
+        "Build this only if you accept: the search was ended by its budget of 5 min (60 % of it are"
     )
     assert "a larger --budget" in words
     within = ended | {"time_budget": {"minutes": 5.0, "ended": False}}
