@@ -24,6 +24,7 @@ from ccd_casadi.fixed_structure.figures import constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, RowPlaces
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.inner_problem.kinds import loop_on
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import nearby, plants_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import with_structured
@@ -341,6 +342,35 @@ def test_an_error_of_the_gain_moves_what_u_moves_alone(ports: Key, run: Sampling
     for share, outcome in ((1.005, ProofOutcome.PROVEN), (0.99, ProofOutcome.REFUTED)):
         bounds = replace(loose, compliance_max=share * float(own.max()))
         assert prove(box, *of, bounds, run).outcome is outcome
+
+
+def test_a_peak_near_rest_is_proven_over_an_error_of_the_gain() -> None:
+    """Below ω_low all figures fall with frequency, which alone was divided: 1.1/0.9 was left."""
+    values = {"gain": 3e4, "integrator": HZ * 0.5, "lead 1 zero": HZ * 5.0,
+              "roll-off 1 damping": 0.7}  # fmt: skip
+    kappa = np.log([values.get(name, HZ * 900.0) for name in STRUCTURE.names])
+    K, box = STRUCTURE.state_space(kappa), box_of(1, 1, BARE, gain=0.1, resonance_shift=0.02)
+    bounds = replace(BOUNDS, S_max=20.0, S_low=20.0, omega_low=HZ * 8.0, shape=None)
+    judged = certify(box.as_written(box.corners()), K, bounds, RUNS[1])
+    peak = max(one.GS for one in judged.plants)
+    assert all(one.low_compliance < 0.9 * peak for one in judged.plants)  # it lies below ω_low
+    proof = prove(box, STRUCTURE, kappa, HZ * 2.0, replace(bounds, compliance_max=1.005 * peak),
+                  RUNS[1])  # fmt: skip
+    assert proof.outcome is ProofOutcome.PROVEN, proof
+
+
+def test_a_member_behind_an_amplifier_has_its_own_forces(tmp_path: Path) -> None:
+    """What disturbing forces move has no states of the amplifier: loops of the set are made."""
+    more = "gain = 0.1\n[actuator]\nlag_hz = 2000.0"
+    problem = problem_in(tmp_path, 'ports = "none"', more)
+    problem = with_structured(problem, structure=STRUCTURE)
+    K, uncertain = STRUCTURE.state_space(a_controller()), uncertain_plant(problem, problem.start)
+    points = uncertain.corners()
+    judged = certify(uncertain.as_written(points), K, BOUNDS, problem.sampling)
+    for (option, point), own in zip(points, judged.plants, strict=True):
+        loop = loop_on(problem, uncertain.plant(point, option).plant_si(), K)
+        assert loop.stable
+        assert loop.peak == pytest.approx(own.S_peak, rel=1e-6)
 
 
 @pytest.mark.parametrize("run", RUNS)
