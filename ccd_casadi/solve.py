@@ -75,9 +75,9 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     from ccd_casadi.reporting.facts import prediction_words
 
     v = FIGURES[result.get("minimise", BANDWIDTH.key)]
-    where = " on every plant" if "plants" in result["certificate"] else ""
-    more = "" if v is BANDWIDTH else " or more"  # which then only has to keep the shape of |S|
-    bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{more}{where}"
+    # of sections the least of all plants, and the frequency of the shape that |S| keeps
+    where = " or more on every plant" if "plants" in result["certificate"] else ""
+    bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     if v is BANDWIDTH:
         lines, reported = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
     else:
