@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, kind_of, loop_budget, member_loops
+from ccd_casadi.inner_problem.kinds import (
+    LoopBudget,
+    design_loops,
+    kind_of,
+    loop_budget,
+    member_loops,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
