@@ -135,6 +135,30 @@ class Move:
         """The RMS value of each force over the move (m,)."""
         return self._rms(self.force)
 
+    def mean_squares(self, cycle: float) -> Array:
+        """Compute the mean square of each force over a way there and back from rest, as of heat.
+
+            f(t), t < T_c;   f(t) - f(t - T_c), T_c ≤ t < 2 T_c
+
+        Parameters
+        ----------
+        cycle : float
+            T_c, of the move and its dwell, s; the way back begins at the next instant.
+
+        Returns
+        -------
+        array (m,)
+            N²; after the end of the simulation each force stays as it is there. Infinite where the
+            simulation was lost.
+        """
+        if not self.finite:
+            return np.full(self.force.shape[1], np.inf)
+        count = int(np.ceil(cycle / self.time[1] * (1.0 - 1e-12)))
+        kept = np.minimum(np.arange(2 * count), len(self.time) - 1)
+        force = self.force[kept]
+        force[count:] -= self.force[kept[:count]]
+        return np.asarray((force**2).mean(axis=0))
+
     @property
     def words(self) -> str:
         """The kind of feedforward, in words."""
@@ -278,7 +302,7 @@ def moves(
 
 def simulate(
     loop: Loop, profile: Setpoint, *, axis: int, forces: Array | None, window: float,
-    bandwidth_hz: float, options: MoveOptions = MoveOptions(),
+    bandwidth_hz: float, until: float = 0.0, options: MoveOptions = MoveOptions(),
 ) -> Move:  # fmt: skip
     """Simulate the move of one output, the others with a setpoint of 0, until it has settled.
 
@@ -298,6 +322,8 @@ def simulate(
         Where the error has settled, unit of y.
     bandwidth_hz : float
         Hz.
+    until : float
+        s: followed so long at least, where it settles.
     options : MoveOptions
         Numbers of the method.
 
@@ -322,7 +348,8 @@ def simulate(
             _switch(driven, loop, ahead, reference, profile, step)
         x = states(A, driven)
         error = np.outer(r[0], wanted) - x @ rows.T
-        if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
+        quiet = np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window  # longer than a slow beat
+        if quiet and time[-1] >= until:
             break
         rest = float(np.abs(r[0, -1] * left).max())  # where all its derivatives are zero
         if turn + 1 >= options.doublings and not (stable and rest <= 0.5 * window):

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.inner_problem.kinds import LoopBudget, design_loops, loop_budget, member_loops
+from ccd_casadi.inner_problem.kinds import (
+    LoopBudget,
+    design_loops,
+    kind_of,
+    loop_budget,
+    member_loops,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost, mechanics
@@ -107,8 +113,9 @@ def move_entry(
     from ccd_casadi.inner_problem.structured_bandwidth import exact_moves, motion_of
 
     motion = motion_of(problem, theta)
-    made = exact_moves(motion, design_loops(problem, theta, controller))
     cycle, own = motion.cycle, problem.source.motion
+    seconds = cycle.profile.duration + own.dwell
+    made = exact_moves(motion, design_loops(problem, theta, controller), 2.0 * seconds)
     times = np.maximum([move.settled for move in made], cycle.profile.duration)
     ahead = motion.forward_force(problem.sampling)
     most, given = (max(float(getattr(one, of).max()) for one in made)
@@ -116,7 +123,10 @@ def move_entry(
     commanded = {} if made[0].command is None else {"needed_command": max(ahead, given)}
     needed = max(float(cycle.peak_force), most, 0.0 if commanded else ahead)
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
-    k, _, limit = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
+    k, R, limit = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
+    squares = np.array([move.mean_squares(seconds) for move in made])  # of forces that currents
+    hottest = int(squares.sum(axis=1).argmax())  # make: also with an error of the gain behind them
+    power = float(R / k**2 * squares[hottest].sum())
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
@@ -131,9 +141,13 @@ def move_entry(
         **({} if own.motor is None else {
             "peak_current": cycle.peak_force / k,
             "needed_current": needed / k,
-            "needed_share": needed / (k * limit)}),
+            "needed_share": needed / (k * limit),
+            "needed_power": power,
+            "needed_heat_share": power / own.motor.rms_power if own.motor.rms_power else 0.0}),
         "feedforward_force": ahead,
         "needed_force": needed,
+        "needed_rms_force": float(squares.max() ** 0.5),
+        "needed_heat_plant": kind_of(problem).plant_words(theta)[hottest],
         **commanded,  # before the actuators
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip

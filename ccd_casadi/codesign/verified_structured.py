@@ -32,7 +32,7 @@ from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.searched_problem import Scenario, state_of, with_state
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plant_words_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of, with_structured
 from ccd_casadi.sampling.structured_units import from_controller
 from ccd_casadi.support.arrays import Array
@@ -217,16 +217,14 @@ class VerifiedStructured(Verified):
         judged = self.design.certificate
         if judged is None or not all(plant.stable for plant in judged.plants):
             return {}
-        uncertain, low = uncertain_plant(self.problem, self.theta), bounds.omega_low / HZ
-        points = [(option, tuple(point)) for option, point in state_of(self.problem).scenarios]
-        points = points or [(option, tuple(point)) for option, point in uncertain.corners()]
+        words, low = plant_words_of(self.problem, self.theta), bounds.omega_low / HZ
         shares = [bounds.shares(plant) for plant in judged.plants]
         found = {}
         for name in shares[0]:
             i = max(range(len(shares)), key=lambda i: shares[i][name])
             at = {"S_max": judged.plants[i].S_peak_frequency / HZ, "S_low": low}
             alone = len(shares) == 1
-            label = "" if alone or i >= len(points) else _plant_words(uncertain.names, *points[i])
+            label = "" if alone or i >= len(words) else words[i]
             found[name] = (label, at.get(name, math.nan))
         return found
 
@@ -302,15 +300,3 @@ class VerifiedStructured(Verified):
         found = [optimum.bandwidth / HZ for optimum in self.optima]
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
         return (*known, ends), figures
-
-
-def _plant_words(names: Sequence[str], option: int, point: Sequence[float]) -> str:
-    parts = [f"[robust] plants {option}"] if option else []
-    for name, value in zip(names, point, strict=True):
-        if name.startswith("theta."):
-            parts.append(f"{name.removeprefix('theta.')} = {value:.4g}")
-        elif name == "damping":
-            parts += [f"damping x {value:g}"] if value != 1.0 else []
-        elif value:
-            parts.append(f"{name} {100.0 * value:+.3g} %")
-    return ", ".join(parts) or "the model"

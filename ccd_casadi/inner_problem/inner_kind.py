@@ -49,6 +49,10 @@ class InnerKind(ABC):
         """The plants on which the controller's figures count, the model first."""
         return [scaled_plant(self.problem, theta)]
 
+    def plant_words(self, theta: Sequence[float]) -> list[str]:
+        """Write how each of `plants` is off the model."""
+        return ["the model"]
+
     def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
         """Return the plants that margins and steps are of: those of a robust set too."""
         return self.plants(theta)

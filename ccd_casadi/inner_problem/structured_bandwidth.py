@@ -56,6 +56,7 @@ class MoveCheckOptions:
     fresh_seed: int = 3000  # added to the problem's, so that no other draw is repeated
     batch: int = 16  # plants that one worker simulates at a time
     steps: float = 10.0  # per duration of the setpoint: a continuous loop has 50 points in each
+    longest: float = 100.0  # durations of the setpoint: a longer dwell is not followed to its end
 
 
 def motion_of(problem: CoDesignProblem, theta: Sequence[float]) -> MotionAt:
@@ -95,7 +96,7 @@ def require_motion(problem: CoDesignProblem) -> None:
     motion_of(problem, problem.start)
 
 
-def exact_moves(motion: MotionAt, loops: Sequence[Loop]) -> list[Move]:
+def exact_moves(motion: MotionAt, loops: Sequence[Loop], until: float = 0.0) -> list[Move]:
     """Simulate the move in loops.
 
     Parameters
@@ -103,18 +104,21 @@ def exact_moves(motion: MotionAt, loops: Sequence[Loop]) -> list[Move]:
     motion : MotionAt
     loops : sequence of Loop
         Closed, SI.
+    until : float
+        s: followed so long at least, but for `MoveCheckOptions.longest`.
 
     Returns
     -------
     list of Move
         Of each loop.
     """
-    profile = motion.cycle.profile
+    profile, options = motion.cycle.profile, MoveCheckOptions()
     return [
         simulate(
             loop, profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
-            bandwidth_hz=MoveCheckOptions.steps / profile.duration,
+            bandwidth_hz=options.steps / profile.duration,
+            until=min(until, options.longest * profile.duration),
         )
         for loop in loops
     ]  # fmt: skip

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.inner_kind import InnerKind
 from ccd_casadi.inner_problem.searched_problem import state_of
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
-from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plant_words_of, plants_of
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -48,6 +48,9 @@ class FixedStructure(InnerKind):
 
     def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
         return plants_of(self.problem, theta)
+
+    def plant_words(self, theta: Sequence[float]) -> list[str]:
+        return plant_words_of(self.problem, theta)
 
     def bounds(self) -> Bounds:
         return bounds_of(self.problem)

@@ -353,9 +353,41 @@ def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPl
     list of ScaledPlant
         The problem's scenarios, or the corners of the box where it has none yet.
     """
-    uncertain, scenarios = uncertain_plant(problem, theta), state_of(problem).scenarios
-    known = [(option, np.array(point)) for option, point in scenarios]
-    return uncertain.plants(known or uncertain.corners())
+    uncertain = uncertain_plant(problem, theta)
+    return uncertain.plants(_points(problem, uncertain))
+
+
+def plant_words_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[str]:
+    """Write how each plant of `plants_of` is off the model.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+
+    Returns
+    -------
+    list of str
+    """
+    uncertain = uncertain_plant(problem, theta)
+    points = _points(problem, uncertain)
+    return [_plant_words(uncertain.names, option, point) for option, point in points]
+
+
+def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+    known = [(option, np.array(point)) for option, point in state_of(problem).scenarios]
+    return known or uncertain.corners()
+
+
+def _plant_words(names: Sequence[str], option: int, point: Array) -> str:
+    parts = [f"[robust] plants {option}"] if option else []
+    for name, value in zip(names, point.tolist(), strict=True):
+        if name.startswith("theta."):
+            parts.append(f"{name.removeprefix('theta.')} = {value:.4g}")
+        elif name == "damping":
+            parts += [f"damping x {value:g}"] if value != 1.0 else []
+        elif value:
+            parts.append(f"{name} {100.0 * value:+.3g} %")
+    return ", ".join(parts) or "the model"
 
 
 def warm_starts_at(

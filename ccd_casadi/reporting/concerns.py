@@ -40,6 +40,7 @@ class ConcernKind(StrEnum):
     UNSTABLE_CONTROLLER = "unstable_controller"
     MOVE = "move"
     CURRENT = "current"
+    HEAT = "heat"
     LOOP = "loop"
     BETWEEN_LINES = "between_lines"
     BUDGET = "budget"
@@ -152,7 +153,8 @@ def loop_concerns(
         [Concern(ConcernKind.LOOP, words) for words in each]
         for each in (found, result.get("loop_warnings", ()))
     )
-    return [*own, *line_concern(result, options), *current_concern(result), *warned]
+    motor = (*current_concern(result), *heat_concern(result))
+    return [*own, *line_concern(result, options), *motor, *warned]
 
 
 def line_concern(
@@ -180,6 +182,24 @@ def current_concern(
     most = move["needed_current"] / share
     words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
     return [Concern(ConcernKind.CURRENT, f"{words}, and peak_current is {most:.4g} A")]
+
+
+def heat_concern(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[Concern]:
+    """List what a move heats its motor by beyond what it allows, on the worst plant; empty where it
+    allows it."""
+    move = result.get("move") or {}
+    share = move.get("needed_heat_share", 0.0)
+    if share is None or not math.isfinite(share):
+        return [Concern(ConcernKind.HEAT, "the heat that the move needs is not known")]
+    if not share > 1.0 + options.slack:
+        return []
+    power, where = move["needed_power"], ""
+    if move["plants"] > 1:
+        where = f" on the worst of {move['plants']} plants ({move['needed_heat_plant']})"
+    words = f"the move needs {power:.4g} W with feedforward and feedback{where}"
+    return [Concern(ConcernKind.HEAT, f"{words}, and rms_power is {power / share:.4g} W")]
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:

@@ -36,6 +36,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which resumes this search",
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
+    "heat": "a larger rms_power, a longer dwell, or less jerk or acceleration in [move]",
     "loop": "with sections least_damping, weighted_level or bandwidth_least_hz; a smaller S_max",
 }
 
@@ -190,6 +191,7 @@ def decide(result: Mapping[str, Any]) -> Decision:
         ConcernKind.SET_UNPROVEN: "unproven",
         ConcernKind.MISPREDICTED: "predicted",
         ConcernKind.CURRENT: "current",
+        ConcernKind.HEAT: "heat",
         ConcernKind.LOOP: "loop",
         ConcernKind.BETWEEN_LINES: "loop",
         ConcernKind.BUDGET: "budget",
@@ -226,8 +228,9 @@ def _decide_loop(result: Mapping[str, Any]) -> Decision:
     step = "a smaller S_max"
     if all(one.reason is ConcernKind.BETWEEN_LINES for one in concerns):
         step = "more lines there, or more averages"
-    if all(one.reason is ConcernKind.CURRENT for one in concerns):
-        step = NEXT["current"]
+    for own in (ConcernKind.CURRENT, ConcernKind.HEAT):
+        if all(one.reason is own for one in concerns):
+            step = NEXT[own]
     return Decision(Build.EXAMINE, tuple(concerns), (step,))
 
 

@@ -8,6 +8,7 @@ from typing import cast
 import casadi as ca
 import numpy as np
 import pytest
+import scipy
 from oracles import random_moves as moves
 from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
@@ -43,7 +44,7 @@ from ccd_casadi.plants.plant import (
     hardware_slopes,
     mechanics,
 )
-from ccd_casadi.reporting.concerns import current_concern
+from ccd_casadi.reporting.concerns import current_concern, heat_concern
 from ccd_casadi.reporting.decision import advice
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
@@ -399,3 +400,111 @@ def test_a_run_counts_what_feedforward_and_feedback_need_of_the_current() -> Non
     assert "a larger peak_current" in advice(short)
     assert not current_concern({"move": entry | {"needed_share": 1.0}})
     assert not current_concern({"move": {"peak_share": 0.8}})  # of an older run
+
+
+HOT = """
+[plant]
+function = "plant.py:slide"
+stiffness = {k}
+[theta.m]
+lower = 3.0
+upper = 5.0
+start = 4.0
+unit = "kg"
+[theta.load]
+lower = 0.0
+upper = 2.0
+start = 1.0
+unit = "kg"
+varies = true
+[objective]
+w1 = 1.0
+w2 = -0.01
+[controller]
+structure = "sections"
+[inner]
+S_max = 2.0
+S_low = 0.1
+omega_low_hz = 2.0
+[loop]
+rate_hz = 4000.0
+delay_us = 250.0
+[robust]
+gain = 0.1
+[move]
+distance = 0.02
+velocity = 0.5
+acceleration = 10.0
+jerk = 4000.0
+settle_band = 1e-6
+dwell = 0.02
+[motor]
+force_constant = 20.0
+resistance = 2.0
+peak_current = 50.0
+rms_power = {power}
+"""
+SLIDE = """
+def slide(theta, stiffness):
+    m = theta["m"] + theta["load"]
+    return {"mass": [[m]], "stiffness": [[stiffness]], "damping": [[0.0]], "input": [1],
+            "output": [[1]], "hardware_cost": theta["m"]}
+"""
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 3e4])
+def test_the_heat_of_a_move_is_that_of_the_hottest_plant(tmp_path: Path, stiffness: float) -> None:
+    """Against an own recursion there and back; free, it is the heavy slide whose motor is weak."""
+    (tmp_path / "plant.py").write_text(SLIDE)
+
+    def problem_with(power: float) -> CoDesignProblem:
+        (tmp_path / "case.toml").write_text(HOT.format(k=stiffness, power=power))
+        return problem_of(load_case(tmp_path / "case.toml"))
+
+    problem = problem_with(2000.0)
+    T, w, one = 1.0 / 4000.0, 2.0 * np.pi * 40.0, np.eye(1)
+    gain, rest = 5.0 * w**2 / 3.0, np.zeros((2, 1))
+    A = np.array([[0.0, 0.0], [0.0, -4.0 * w]])  # an integral, and a lead with its lag
+    C = gain * np.array([[0.2 * w, -1.0]])
+    K = StateSpace(A, np.array([[1.0], [11.0 * 4.0 * w]]), C, 12.0 * gain * one)
+    found = move_entry(problem, problem.start, K)["move"]
+    motion = motion_of(problem, problem.start)
+    profile, count = motion.cycle.profile, int(np.ceil((motion.cycle.profile.duration + 0.02) / T))
+    time = np.arange(2 * count) * T
+
+    def there_and_back(t: np.ndarray) -> np.ndarray:
+        return np.asarray(profile.at(t) - profile.at(t - count * T))
+
+    r = there_and_back(time)
+    ends = [there_and_back(time + side * T / 2) for side in (-1, 1)]
+    r[1:] = (ends[1][:4] - ends[0][:4]) / T
+    ahead, Kz = r.T @ motion.forward[:, 0], tustin(K, T)
+    squares = {}
+    for load in (0.0, 2.0):
+        for factor in (0.9, 1.1):
+            mass, name = 4.0 + load, f"gain {100.0 * (factor - 1.0):+.3g} %, load = {load:g}"
+            whole = np.zeros((3, 3))
+            whole[0, 1], whole[1, 0], whole[1, 2] = 1.0, -stiffness / mass, factor / mass
+            step, x, z, sent, total = scipy.linalg.expm(whole * T), np.zeros(2), rest, 0.0, 0.0
+            for wanted, extra in zip(r[0], ahead, strict=True):
+                e = wanted - x[0]
+                u = float((Kz.C @ z + Kz.D * e)[0, 0]) + extra
+                x, z, sent = step[:2, :2] @ x + step[:2, 2] * sent, Kz.A @ z + Kz.B * e, u
+                total += u**2
+            squares[name] = total / len(r[0])
+    hottest = max(squares, key=lambda name: squares[name])
+    assert stiffness or hottest == "gain -10 %, load = 2"
+    assert found["needed_heat_plant"] == hottest
+    assert found["needed_rms_force"] == pytest.approx(squares[hottest] ** 0.5, rel=1e-6)
+    assert found["needed_power"] == pytest.approx(2.0 / 20.0**2 * squares[hottest], rel=1e-6)
+    assert found["needed_heat_share"] == pytest.approx(found["needed_power"] / 2000.0)
+    assert not heat_concern({"move": found})
+    assert found["needed_power"] > 1.1 * found["power"]
+    hot = problem_with(0.5 * (found["power"] + found["needed_power"]))
+    entry = move_entry(hot, hot.start, K)
+    assert entry["move"]["heat_share"] < 1.0 < entry["move"]["needed_heat_share"]
+    (concern,) = heat_concern(entry)
+    assert f"on the worst of 5 plants ({hottest})" in concern.words
+    assert f"rms_power is {hot.source.motion.motor.rms_power:.4g} W" in concern.words
+    assert "a larger rms_power" in advice({"status": "verified", **entry})
+    assert not heat_concern({"move": {"heat_share": 1.0}})  # of an older run

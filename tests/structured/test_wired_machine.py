@@ -237,6 +237,9 @@ def test_a_move_has_the_amplifiers_force_and_its_command(tmp_path: Path) -> None
     commanded = max(np.abs(command).max(), found["feedforward_force"])
     assert found["needed_command"] == pytest.approx(commanded, rel=1e-9)
     assert abs(found["needed_command"] / found["needed_force"] - 1.0) > 0.01
+    count = int(np.ceil(profile.duration / T))  # there and back without a dwell, by the amplifier
+    heat = np.append(force[:count], force[count : 2 * count] - force[:count])
+    assert found["needed_rms_force"] == pytest.approx(np.mean(heat**2) ** 0.5, rel=1e-6)
     outside = np.flatnonzero(np.abs(error) > found["window"])
     assert found["settled"] == pytest.approx(time[outside[-1] + 1], abs=1.01 * T)
     (loop,) = design_loops(problem, problem.start, K)[:1]
