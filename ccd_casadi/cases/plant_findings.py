@@ -138,9 +138,7 @@ def controller_findings(problem: CoDesignProblem) -> list[CaseFinding]:
     return [CaseFinding(Severity.NOTE, Topic.CONTROLLER, item) for item in words]
 
 
-def rest_findings(
-    problem: CoDesignProblem, points: Sequence[Sequence[float]]
-) -> list[CaseFinding]:
+def rest_findings(problem: CoDesignProblem, points: Sequence[Sequence[float]]) -> list[CaseFinding]:
     """Warn of a bound of the compliance that no controller with an integrator meets, as what is
     between its sensor and where the error counts moves further at rest.
 
