@@ -186,8 +186,8 @@ def rest_findings(problem: CoDesignProblem, points: Sequence[Sequence[float]]) -
         f"inner.compliance_max: {size(most)} is below {size(moved[worst])}, which a force at rest "
         f"moves where the error counts with the sensor held still, {place(worst)}: no controller "
         f"with an integrator changes that; of {len(points)} points of the box {int(over.sum())} "
-        f"exceed it, and the least is {size(moved[least])} {place(least)}; raise compliance_max, or "
-        "stiffen what is between sensor and performance"
+        f"exceed it, and the least is {size(moved[least])} {place(least)}; raise compliance_max, "
+        "or stiffen what lies between sensor and performance"
     )
     severity = Severity.WARNING if over[0] else Severity.NOTE
     return [CaseFinding(severity, Topic.LOOP, words)]

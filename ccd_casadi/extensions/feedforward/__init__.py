@@ -91,7 +91,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     )  # fmt: skip
     place = place_words(run)
     notes = [f"all {place}"] if place else []
-    answer = entry(found, options.axis) | {"notes": notes, "seed": options.seed, "versions": versions(),
+    answer = entry(found, options.axis) | {"notes": notes, "seed": options.seed,
+                                           "versions": versions(),
                                            "seconds": options.seconds()}  # fmt: skip
     write_json(folder / FILE, answer)
     write_code(folder, answer)
