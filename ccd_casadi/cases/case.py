@@ -373,6 +373,8 @@ def _default(item: Field[Any]) -> str:
     it of no effect, so that it need not be given there."""
     if item.default is MISSING:
         return "required" if item.metadata["idle"] is None else "required*"
+    if item.metadata["needed"]:
+        return "required*"
     return "–" if item.default in (None, ()) else toml(item.default)
 
 

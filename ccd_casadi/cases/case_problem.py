@@ -214,7 +214,14 @@ def _require_ports_known(problem: CoDesignProblem) -> None:
     if sections is None:
         refuse_ports(problem, 'full order, but to controller.structure = "sections" alone')
     elif sections.figure is not BANDWIDTH:
-        refuse_ports(problem, f'inner.minimise = "{sections.minimise}"')
+        timed = sections.minimise == "move_time"
+        what, table = ("time", "[move]") if timed else ("error", "[budget]")
+        remedy = (
+            f'give minimise = "bandwidth", which reports the {what} of {table} with them, or let '
+            f"the plant function not return them: the least {what} is then of the sensor's error "
+            "alone, and no page shows it elsewhere"
+        )
+        refuse_ports(problem, f'inner.minimise = "{sections.minimise}"', remedy)
     elif sections.compliance_max is not None:
         from ccd_casadi.inner_problem.structured_plant_set import require_bounded_ports
 

@@ -291,13 +291,14 @@ SUFFIXES = {"_hz": "Hz", "_us": "µs", "_ms": "ms"}
 
 def key(
     says: str, default: Any = MISSING, *, check: KeyCheck | None = None, unit: str = "",
-    idle: Any = None,
+    idle: Any = None, needed: bool = False,
 ) -> Any:  # fmt: skip
     """The field of a table's dataclass that a key is; `check` where its type has another one.
 
-    `idle`: what a required key is where it has no effect, and is not given.
+    `idle`: what a required key is where it has no effect, and is not given. `needed`: a table that
+    is given needs this key of no default.
     """
-    metadata = {"check": check, "says": says, "unit": unit, "idle": idle}
+    metadata = {"check": check, "says": says, "unit": unit, "idle": idle, "needed": needed}
     if default is MISSING:
         return field(metadata=metadata)
     return field(default=default, metadata=metadata)

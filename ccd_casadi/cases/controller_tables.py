@@ -42,14 +42,18 @@ class MotorTable:
 class MoveTable:
     """[move]: a setpoint of third or fourth order, made over and over."""
 
-    distance: float | None = key("length of the move, from rest to rest", None, unit="m")
-    velocity: float | None = key("largest", None, unit="m/s")
+    distance: float | None = key(
+        "length of the move, from rest to rest", None, unit="m", needed=True
+    )
+    velocity: float | None = key("largest", None, unit="m/s", needed=True)
     acceleration: float | None = key(
         "of the move; absent: the largest that the motor allows", None, unit="m/s²"
     )
-    jerk: float | None = key("largest", None, unit="m/s³")
+    jerk: float | None = key("largest", None, unit="m/s³", needed=True)
     snap: float | None = key("largest; absent: jerk/sample", None, unit="m/s⁴")
-    settle_band: float | None = key("half width of the window of the error", None, unit="m")
+    settle_band: float | None = key(
+        "half width of the window of the error", None, unit="m", needed=True
+    )
     dwell: float = key("pause between two moves", 0.0, check=NOT_NEGATIVE, unit="s")
 
 

@@ -30,6 +30,7 @@ from ccd_casadi.cases.plant_findings import (
     loop_findings,
     most_limiting,
     outside_findings,
+    rest_findings,
     rigid_findings,
     zero_findings,
 )
@@ -103,6 +104,7 @@ def diagnose(
     PlantError
         The model's function fails.
     """
+    own = problem
     if isinstance(problem.controller, StructuredProblem):
         problem = with_ranges(problem)
     plant = plant_of(problem)
@@ -146,6 +148,8 @@ def diagnose(
             facts.append(found)
         progress.advance()
     findings = [*most_limiting(findings), *_unmet(plant, facts)]
+    if not any(item.severity is Severity.ERROR for item in findings):
+        findings += rest_findings(own, points_to_check(own, seed, options=options))
     counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
     if len(counts) > 1 and rigid_modes is None:
         words = (

@@ -302,6 +302,10 @@ def _move_words(
                 f"{value:.4g} m{unit} meant? Then write {1e-3 * value:.4g}"
             )
             words.append(f"move.{key}: {spoken(found)}")
+    far = limits.stroke
+    if problem.spoken[0] == "rad" and 2.0 * np.pi < far < np.inf:
+        found = f"{far:.4g} rad is more than a turn: was {far:.4g} deg meant? Then write"
+        words.append(f"move.distance: {found} {np.radians(far):.4g}")
     if seconds > options.longest:
         words.append(f"[move] takes {seconds:.3g} s: is a limit of it in another unit?")
     if motion.window >= limits.stroke:

@@ -15,12 +15,13 @@ from ccd_casadi.cases.findings import (
 )
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_plant_set import bounded_ports, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import ModalPlant, Suspension
-from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.plant import Mechanics, Plant, named_values
 from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, spoken, with_unit
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,61 @@ def controller_findings(problem: CoDesignProblem) -> list[CaseFinding]:
             "decay; 2 Hz cost 4 % of the bandwidth of 47 Hz on a shipped case"
         )
     return [CaseFinding(Severity.NOTE, Topic.CONTROLLER, item) for item in words]
+
+
+def rest_findings(problem: CoDesignProblem, points: Sequence[Sequence[float]]) -> list[CaseFinding]:
+    """Warn of a bound of the compliance that no controller with an integrator meets, as what is
+    between its sensor and where the error counts moves further at rest.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    points : sequence of sequences of float
+        θ to examine, the start first: there over the corners of the [robust] set, and on the worst
+        of these at the others.
+
+    Returns
+    -------
+    list of CaseFinding
+        A warning of the start; a note where the start alone meets it.
+    """
+    own = problem.controller
+    if not isinstance(own, StructuredProblem) or not own.structure.integrator:
+        return []
+    most, ports = own.compliance_max, bounded_ports(problem)[1]
+    if most is None or ports is None or not ports.counted:
+        return []
+    start = uncertain_plant(problem, points[0])
+    corners = start.corners()
+    found = [start.plant(point, option).held_compliance for option, point in corners]
+    option, point = corners[int(np.argmax(found))]
+    moved = np.array([
+        max(found),
+        *(uncertain_plant(problem, at).plant(point, option).held_compliance for at in points[1:]),
+    ])  # fmt: skip
+    over, least = moved > most, int(moved.argmin())
+    if not over.any():
+        return []
+    worst = 0 if over[0] else int(moved.argmax())
+    unit = spoken("m/N").removeprefix(spoken("m"))
+
+    def size(value: float) -> str:
+        return with_unit(value, spoken("m")) + unit
+
+    def place(index: int) -> str:
+        return "at the start" if index == 0 else (
+            f"at theta = {named_values(problem.names, points[index])}"
+        )  # fmt: skip
+
+    words = (
+        f"inner.compliance_max: {size(most)} is below {size(moved[worst])}, which a force at rest "
+        f"moves where the error counts with the sensor held still, {place(worst)}: no controller "
+        f"with an integrator changes that; of {len(points)} points of the box {int(over.sum())} "
+        f"exceed it, and the least is {size(moved[least])} {place(least)}; raise compliance_max, "
+        "or stiffen what lies between sensor and performance"
+    )
+    severity = Severity.WARNING if over[0] else Severity.NOTE
+    return [CaseFinding(severity, Topic.LOOP, words)]
 
 
 def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:

@@ -235,7 +235,9 @@ def with_ports(problem: CoDesignProblem) -> CoDesignProblem:
     return replace(problem, source=replace(problem.source, wide=True))
 
 
-def refuse_ports(problem: CoDesignProblem, what: str) -> None:
+def refuse_ports(
+    problem: CoDesignProblem, what: str, remedy: str = "drop one or the other"
+) -> None:
     """Refuse a problem whose plant says where other forces act, or where the error counts.
 
     Parameters
@@ -243,6 +245,8 @@ def refuse_ports(problem: CoDesignProblem, what: str) -> None:
     problem : CoDesignProblem
     what : str
         Which does not know them, such as "controllers of full order".
+    remedy : str
+        What to change.
 
     Raises
     ------
@@ -251,7 +255,7 @@ def refuse_ports(problem: CoDesignProblem, what: str) -> None:
     """
     if ports := plant_of(problem).ports:
         words = f"{' and '.join(ports)} are not known to {what}"
-        raise PlantError(f"{words}; drop one or the other")
+        raise PlantError(f"{words}; {remedy}")
 
 
 def require_as_returned(problem: CoDesignProblem, theta: Sequence[float]) -> None:

@@ -269,6 +269,30 @@ class ScaledPlant:
         found = replace(self, dA=factors * self.dA, dB=factors * self.dB, dC=factors * self.dC)
         return found.forced_as(lambda own: own.with_slopes_times(factors))
 
+    @property
+    def held_compliance(self) -> float:
+        """σ_max of what a force at rest moves where the error counts while u holds the sensors
+        still, m/N.
+
+            A x + B u + E d = 0,   C x = 0,   z = F x
+
+        Every controller with an integrator leaves that. 0: the sensors are where the error counts;
+        NaN: u cannot hold them at rest.
+        """
+        own, counted = self.mechanics, self.counted
+        if own is None or counted is None:
+            return 0.0
+        n, p = len(self.A), len(self.C)
+        held = np.block([[self.A, counted.B], [self.C, np.zeros((p, counted.B.shape[1]))]])
+        rows = np.abs(held).max(axis=1, keepdims=True)
+        columns = np.abs(held / rows).max(axis=0)
+        held = held / rows / columns
+        if not np.linalg.cond(held) < np.finfo(float).eps ** -0.75:  # a zero at rest
+            return np.nan
+        force = np.vstack([own.B, np.zeros((p, own.B.shape[1]))]) / rows
+        x = -np.linalg.solve(held, force)[:n] / columns[:n, None]
+        return float(np.linalg.norm(own.C[p:] @ x, 2)) / self.force
+
     def forced_as(self, changed: "Callable[[ScaledPlant], ScaledPlant]") -> "ScaledPlant":
         """With what disturbing forces move, and what counts, `changed`."""
         both = self.mechanics, self.counted

@@ -234,7 +234,7 @@ def compliance_panel(view: LoopView) -> Panel:
     curves, bands = of_plants(view.hz, factor * view.sizes[3])
     words = f"compliance_max {with_unit(most or 0.0, spoken('m'))}{spoken('/N')}"
     levels = () if most is None else (Level(factor * most, words, colour=GREY),)
-    label = f"{view.name_gain('GS')} ({unit}/N)"
+    label = f"{view.name_gain('GS')} ({unit}{spoken('/N')})"
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 

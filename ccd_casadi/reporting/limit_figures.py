@@ -201,7 +201,7 @@ def _budget_table(found: LoopBudget, model: "BudgetFigures") -> tuple[c.Words, c
     unit, scale = display_unit(spoken("m"), model.error)
     head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
     head += [f"MA ({unit})", f"MSD ({unit})"] if windowed else []
-    head += ["RMS force (N)"]
+    head += [spoken("RMS force (N)")]
     rows = []
     for item in model.sources:
         share = 100.0 * (item.error / model.error) ** 2 if model.error > 0.0 else 0.0

@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.analysis import LIMITS
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.move import Move, feedforward_of, moves
+from ccd_casadi.analysis.move import Move, feedforward_of, forward_force, moves
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
@@ -110,15 +110,24 @@ def cycle_chapter(
     profile, settled = found.cycle.profile, shown["settled_latest"]
     k, R, _ = motor.at(found.mass)
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
+    if problem.sampling is not None:  # what is held for a period from each of its instants on
+        T = problem.sampling.period
+        time = np.arange(np.ceil(time[-1] / T) + 1) * T
     r = profile.at(time)
     bodies = found.body_forces(r)  # behind an actuator the rest makes up for its lag
-    force = bodies if problem.source.wiring.actuator else r.T @ found.forward
+    force = bodies
+    if not problem.source.wiring.actuator:
+        force = r.T @ found.forward
+        if problem.sampling is not None:
+            force = forward_force(profile, found.forward, time, problem.sampling.period)[1]
     heat = R / k**2 * (bodies**2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(shown["power"], "mean")
     ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration
     panels = [
-        c.Panel("time (ms)", "force of a motor (N)", (c.Curve(ms, force[:, 0]),), levels=(end,)),
+        c.Panel(
+            "time (ms)", spoken("force of a motor (N)"), (c.Curve(ms, force[:, 0]),), levels=(end,)
+        ),
         c.Panel("time (ms)", "its current (A)", (c.Curve(ms, force[:, 0] / k),)),
         c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
@@ -203,7 +212,9 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
                                 levels=(end, *window)))  # fmt: skip
             end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
-    panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,), legend=None))
+    panels.append(
+        c.Panel("time (ms)", spoken("force 1 (N)"), tuple(force), levels=(end,), legend=None)
+    )
     lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
     figures = dict(FIGURES)
     if first.command is not None:

@@ -48,6 +48,8 @@ def spoken(words: str) -> str:
     ('1 N moves it 3 mm, 3 mm/N', None)
     >>> spoken("1 N moves it 3 mm, 3 mm/N; N/m"), use_units("m", "N")
     ('1 N m moves it 3 mrad, 3 mrad/(N m); N m/rad', None)
+    >>> use_units("rad", "N m"), spoken("force (N)"), use_units("m", "N")
+    (None, 'force (N m)', None)
     """
     output, force = _spoken["m"], _spoken["N"]
     words = re.sub(r"(?<!\w)([nµum]?)m(?!\w)", rf"\g<1>{output}", words)
@@ -56,7 +58,7 @@ def spoken(words: str) -> str:
     if force == "N m":
         words = re.sub(r"\bkg\b", "kg m²", words)
     words = re.sub(r"/N\b", f"/({force})" if " " in force else f"/{force}", words)
-    return re.sub(r"(?<![\w(])([kMG]?)N\b", rf"\g<1>{force}", words)
+    return re.sub(r"(?<!\w)(?<!/\()([kMG]?)N\b", rf"\g<1>{force}", words)
 
 
 def is_force(unit: str) -> bool:

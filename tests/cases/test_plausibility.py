@@ -70,6 +70,19 @@ def test_a_motor_or_a_move_of_no_machine_is_a_question_by_its_key(
     assert check([str(path), "--quiet"]) == 0
 
 
+@pytest.mark.parametrize("output", ["m", "rad"])
+@pytest.mark.parametrize("far", ["30.0", "6.0"])
+def test_a_rotation_beyond_a_turn_may_be_in_degrees(tmp_path: Path, output: str, far: str) -> None:
+    """A distance in m is not asked about degrees."""
+    change = ("distance = 0.1", f"distance = {far}")
+    path = axis(tmp_path, change, ("[move]", f'[units]\noutput = "{output}"\n[move]'))
+    try:
+        words = [item for item in questions(path) if "deg meant? Then write 0.5236" in item]
+    finally:
+        use_units("m", "N")
+    assert bool(words) == (output == "rad" and far == "30.0")
+
+
 def case_study(**more: Any) -> Case:
     tables = tomllib.loads(ccd.TWO_MASS.read_text(encoding="utf-8"))
     for name, keys in more.items():

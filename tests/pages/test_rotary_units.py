@@ -2,17 +2,22 @@
 
 import re
 import tomllib
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 import ccd_casadi as ccd
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import case_to_toml
 from ccd_casadi.cases.diagnosis import diagnose, plant_report
 from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.reporting.facts import facts
-from ccd_casadi.reporting.moves import way_words
+from ccd_casadi.reporting.moves import cycle_chapter, way_words
 from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.text import spoken, use_units
 
 LINEAR = re.compile(r"\d [kMG]?N\b(?! m)|/N\b|(?<![\w])[nµum]?m\b(?=/N|$)|\bN/|\bkg\b(?! m²)")
 TABLES = tomllib.loads(ccd.TWO_MASS.read_text(encoding="utf-8"))
@@ -55,3 +60,34 @@ def test_what_holds_a_stage_on_springs_is_said_with_its_move() -> None:
 
     assert "12.5 MN hold the stage there" in words(pushed)
     assert "hold" not in words(free)
+
+
+def test_a_unit_in_brackets_is_the_cases_too() -> None:
+    """Of axes and heads; a unit that is a quotient has its own brackets once."""
+    use_units("rad", "N m")
+    try:
+        said = [spoken(words) for words in ("force 1 (N)", "gain (N/m)", "left (µm/N)", "/N")]
+    finally:
+        use_units("m", "N")
+    assert said == ["force 1 (N m)", "gain (N m/rad)", "left (µrad/(N m))", "/(N m)"]
+
+
+def test_the_motors_figure_is_the_feedforward_that_the_loop_holds() -> None:
+    """Its largest force is that of `result.json`, and its axis has the case's unit."""
+    path = Path(ccd.__file__).parents[1] / "examples" / "linear_motor_axis" / "case.toml"
+    case = ccd.load_case(path)
+    sampled = replace(case, loop=replace(case.loop, rate_hz=8000.0, delay_us=125.0))
+    problem = ccd.problem_of(replace(sampled, units=replace(case.units, output="rad", input="N m")))
+    try:
+        motion = motion_of(problem, problem.start)
+        shares = {"peak_share": 1.0, "heat_share": 1.0, "settled_latest": None, "power": 1.0}
+        shown = {"peak_force": 1.0, "peak_current": 1.0, "rms_force": 1.0, "limits": []} | shares
+        (chapter,) = cycle_chapter(problem, problem.start, {"move": shown})
+        figure = chapter.body[0]
+        panel = figure.drawing.rows[0][0]
+    finally:
+        use_units("m", "N")
+    most = float(np.abs(panel.curves[0].y).max())
+    assert most == pytest.approx(motion.forward_force(problem.sampling), rel=1e-9)
+    assert panel.y_label.endswith("(N m)")
+    assert "feedforward alone" in figure.caption

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.checks import CaseError
+from ccd_casadi.cases.diagnosis import diagnose, suspicions
 from ccd_casadi.codesign.final_judgement import other_damping, plants_of_set
 from ccd_casadi.codesign.joint_model import JointModel, JointPoint
 from ccd_casadi.codesign.survival import loops_of
@@ -442,6 +443,42 @@ def problem_in(folder: Path, options: str = "", more: str = "") -> CoDesignProbl
     text = CASE.replace("OPTIONS", options).replace("MORE", more)
     (folder / "case.toml").write_text(text)
     return problem_of(load_case(folder / "case.toml"))
+
+
+@pytest.mark.parametrize("wired", [BARE, AMPLIFIER, BOTH])
+@pytest.mark.parametrize("shift", [-0.1, 0.0, 0.2])
+def test_the_spring_yields_however_stiff_the_loop_is(wired: int, shift: float) -> None:
+    """A held table and a force at its tool: 1/k, the same as of any loop with an integrator."""
+    box = box_of(1, 1, wired, resonance_shift=0.3, gain=0.3)
+    found = box.plant(np.array([shift, -0.2])).held_compliance
+    assert found == pytest.approx(1.2 / (SPRING * (1.0 + shift) ** 2), rel=1e-9)  # 1e-14 found
+    K = StateSpace(*(np.array([[x]]) for x in (0.0, 1.0, 1e7, 0.0)))  # an integrator alone
+    at_rest = moved(first_order(1, 1, wired, shift), K, None, np.array([0.1]))
+    assert at_rest[0] == pytest.approx(found, rel=1e-5)
+    at_sensor = box_of(1, 0, wired).plant(np.zeros(0)).held_compliance
+    assert at_sensor == pytest.approx(0.0, abs=1e-9 * found)
+
+
+@pytest.mark.parametrize(
+    ("most", "severity", "count"),
+    [("2.0e-6", "warning", 6), ("3.4e-6", "warning", 3), ("4.0e-6", "note", 2), ("6e-6", "", 0)],
+)
+def test_a_compliance_below_that_of_the_held_sensor_is_a_warning(
+    tmp_path: Path, most: str, severity: str, count: int
+) -> None:
+    """1/k is 3.33 um/N at the start and 3.47 on the softest plant of its set, 2.31 to 4.96 over
+    the box."""
+    problem_in(tmp_path)
+    case = tmp_path / "case.toml"
+    case.write_text(case.read_text().replace("compliance_max = 3e-5", f"compliance_max = {most}"))
+    found = diagnose(problem := problem_of(load_case(case)))[1]
+    words = [item for item in found if "compliance_max" in item.words]
+    assert [item.severity.value for item in words] == [severity] * bool(severity)
+    assert not words or f"of 6 points of the box {count} exceed it" in words[0].words
+    assert not words or "the least is 2.31 µm/N at theta" in words[0].words
+    assert bool(words) == any("sensor held still" in cause for cause in suspicions(problem))
+    loose = with_structured(problem, structure=Structure(integrator=False))
+    assert not [item for item in diagnose(loose)[1] if "compliance_max" in item.words]
 
 
 @pytest.mark.parametrize("more", ["", "[actuator]\nlag_hz = 2000.0"])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ccd_casadi.deployment.on_hardware import move
 from ccd_casadi.deployment.realisation import realise_blocks
 from ccd_casadi.drive import main as drive
 from ccd_casadi.explore import main as explore
+from ccd_casadi.extensions.feedforward.feedforward_files import place_words
 from ccd_casadi.inner_problem.kinds import design_loops, loop_budget, member_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of
@@ -304,16 +306,27 @@ def test_a_plant_without_ports_is_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("S_max = 2.5", 'S_max = 2.5\nminimise = "rms_error"', "inner.minimise"),
+        (
+            "S_max = 2.5",
+            'S_max = 2.5\nminimise = "rms_error"',
+            "the error of .budget. with them",
+        ),
+        ("S_max = 2.5", 'S_max = 2.5\nminimise = "move_time"', "time of .move. with them"),
         ('structure = "sections"', 'structure = "h_infinity"', "full order"),
     ],
 )
-def test_what_does_not_know_them_is_named(
-    tmp_path: Path, old: str, new: str, words: str
-) -> None:
-    budget = CASE[CASE.index("[move]") : CASE.index("[budget.force]")]
+def test_what_does_not_know_them_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+    first = "[budget" if "move_time" in new else "[move]"
+    budget = CASE[CASE.index(first) : CASE.index("[budget.force]")]
     with pytest.raises(CaseError, match=words):
         problem_in(tmp_path, "" if "h_inf" in new else SAMPLED, own=(old, new), move=(budget, ""))
+
+
+def test_a_feedforward_for_the_sensor_is_called_that(tmp_path: Path) -> None:
+    """Where the error counts elsewhere, and nowhere else."""
+    assert "not of `performance`" in place_words(SimpleNamespace(problem=problem_in(tmp_path)))
+    plain = problem_in(tmp_path, options="ports = false")
+    assert place_words(SimpleNamespace(problem=plain)) == ""
 
 
 def test_commands_that_do_not_know_them_say_so(

@@ -60,6 +60,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.extensions.feedforward.feedforward_files import (
         entry,
         feedforward_page,
+        place_words,
         summary,
         write_code,
     )
@@ -88,11 +89,14 @@ def main(options: argparse.Namespace) -> ExitCode:
         run, setpoint(limits), window, axis=options.axis - 1, taps=options.taps, seed=options.seed,
         options=FeedforwardSetOptions(judges=options.judges),
     )  # fmt: skip
-    answer = entry(found, options.axis) | {"seed": options.seed, "versions": versions(),
+    place = place_words(run)
+    notes = [f"all {place}"] if place else []
+    answer = entry(found, options.axis) | {"notes": notes, "seed": options.seed,
+                                           "versions": versions(),
                                            "seconds": options.seconds()}  # fmt: skip
     write_json(folder / FILE, answer)
     write_code(folder, answer)
-    inform("\n".join(summary(found)))
+    inform("\n".join([*summary(found), *(f"note          {words}" for words in notes)]))
     publish(run.folder, folder / "report.html", feedforward_page(run, found, index_of(folder)))
     inform(f"page          {folder / 'report.html'}")
     return _end(found)

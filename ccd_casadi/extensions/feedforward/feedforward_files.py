@@ -20,6 +20,7 @@ from ccd_casadi.extensions.feedforward.coefficients import (
     responses_of,
 )
 from ccd_casadi.extensions.feedforward.set_feedforward import SetFeedforward
+from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import run_name
 from ccd_casadi.support.arrays import Array
@@ -98,6 +99,13 @@ def move_words(found: SetFeedforward) -> str:
     far = with_unit(float(np.abs(found.responses[0].end).max()), unit)
     window = with_unit(found.window, unit)
     return f"{far} in {1e3 * found.profile.duration:.4g} ms, settled within ±{window}"
+
+
+def place_words(run: FinishedRun) -> str:
+    """What a reader must know where the error counts elsewhere than at the sensor; else empty."""
+    if "performance" not in plant_of(run.problem).ports:
+        return ""
+    return "figures are of the sensor's position, not of `performance`, where the error counts"
 
 
 def in_ms(seconds: float) -> str:
@@ -236,6 +244,8 @@ def feedforward_page(run: FinishedRun, found: SetFeedforward, index: str = "") -
         f"{100.0 * found.heat / found.limits.heat:.4g} %, and the largest force "
         f"{100.0 * found.peak / found.limits.peak:.4g} %, of what the inverse needs."
     )
+    if place := place_words(run):
+        lead += f" All {place}."
     head = c.Head(
         f"Feedforward of {run_name(run.folder)}",
         "bad" if not good else "good" if len(found.judged) else "warn",
