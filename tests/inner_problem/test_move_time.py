@@ -436,8 +436,8 @@ distance = 0.02
 velocity = 0.5
 acceleration = 10.0
 jerk = 4000.0
-settle_band = 1e-6
-dwell = 0.02
+settle_band = 1e-3
+dwell = 0.1
 [motor]
 force_constant = 20.0
 resistance = 2.0
@@ -469,7 +469,7 @@ def test_the_heat_of_a_move_is_that_of_the_hottest_plant(tmp_path: Path, stiffne
     K = StateSpace(A, np.array([[1.0], [11.0 * 4.0 * w]]), C, 12.0 * gain * one)
     found = move_entry(problem, problem.start, K)["move"]
     motion = motion_of(problem, problem.start)
-    profile, count = motion.cycle.profile, int(np.ceil((motion.cycle.profile.duration + 0.02) / T))
+    profile, count = motion.cycle.profile, int(np.ceil((motion.cycle.profile.duration + 0.1) / T))
     time = np.arange(2 * count) * T
 
     def there_and_back(t: np.ndarray) -> np.ndarray:
