@@ -116,7 +116,8 @@ def cycle_chapter(
     r = profile.at(time)
     bodies = found.body_forces(r)  # behind an actuator the rest makes up for its lag
     force = bodies
-    if not problem.source.wiring.actuator:
+    lagged = bool(problem.source.wiring.actuator)
+    if not lagged:
         force = r.T @ found.forward
         if problem.sampling is not None:
             force = forward_force(profile, found.forward, time, problem.sampling.period)[1]
@@ -142,7 +143,7 @@ def cycle_chapter(
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
     held = found.holding is not None
-    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held)
+    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held, lagged)
     words = paragraph("report.cycle", shown, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
