@@ -4,9 +4,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from ccd_casadi.codesign.verified_structured import _plant_words
+from ccd_casadi.inner_problem.structured_plant_set import _plant_words
 from ccd_casadi.reporting.facts import requirement_lines, requirements_table
 
 
@@ -35,9 +36,9 @@ def test_a_figure_that_is_not_known_is_no_figure() -> None:
 
 def test_a_plant_is_named_by_what_it_differs_in() -> None:
     names = ("resonance_shift", "damping", "gain", "theta.load")
-    assert _plant_words(names, 0, (-0.03, 1.0, 0.0, 4.0)) == "resonance_shift -3 %, load = 4"
+    assert _plant_words(names, 0, np.array([-0.03, 1.0, 0.0, 4.0])) == "resonance_shift -3 %, load = 4"
     assert (
-        _plant_words(names[:3], 2, (0.0, 0.5, 0.05))
+        _plant_words(names[:3], 2, np.array([0.0, 0.5, 0.05]))
         == "[robust] plants 2, damping x 0.5, gain +5 %"
     )
-    assert _plant_words(names[:3], 0, (0.0, 1.0, 0.0)) == "the model"
+    assert _plant_words(names[:3], 0, np.array([0.0, 1.0, 0.0])) == "the model"
