@@ -36,7 +36,8 @@ def test_a_figure_that_is_not_known_is_no_figure() -> None:
 
 def test_a_plant_is_named_by_what_it_differs_in() -> None:
     names = ("resonance_shift", "damping", "gain", "theta.load")
-    assert _plant_words(names, 0, np.array([-0.03, 1.0, 0.0, 4.0])) == "resonance_shift -3 %, load = 4"
+    at = np.array([-0.03, 1.0, 0.0, 4.0])
+    assert _plant_words(names, 0, at) == "resonance_shift -3 %, load = 4"
     assert (
         _plant_words(names[:3], 2, np.array([0.0, 0.5, 0.05]))
         == "[robust] plants 2, damping x 0.5, gain +5 %"
