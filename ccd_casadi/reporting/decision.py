@@ -36,7 +36,7 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which resumes this search",
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
-    "heat": "less acceleration, given in [move] (then a longer dwell or larger rms_power too)",
+    "heat": "less acceleration, given in [move]; then a longer dwell or a larger rms_power",
     "loop": "with sections least_damping, weighted_level or bandwidth_least_hz; a smaller S_max",
 }
 
