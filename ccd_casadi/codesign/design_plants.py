@@ -8,7 +8,6 @@ the plant alone the set is widened step by step, each design polished on the pro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -17,16 +16,10 @@ from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
-from ccd_casadi.inner_problem.sweep import missed_bounds
-from ccd_casadi.plants.plant import named_values
+from ccd_casadi.inner_problem.problem import design_choices
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ
 from ccd_casadi.support.time_budget import time_is_up
-
-if TYPE_CHECKING:
-    from ccd_casadi.codesign.outer_mixed import VerifiedDesign
 
 CONTINUED = "reached by continuation from narrower ranges"
 REPORTED = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
@@ -118,50 +111,3 @@ def order(item: Solution) -> tuple[int, int, float]:
     failed = sum(passed is False for passed in result.get("checks", {}).values())
     status = ("verified", "not_verified", "infeasible").index(result["status"])
     return status, failed, result.get("objective", np.inf)
-
-
-def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
-    """Describe why a search failed: where it searched, how near it came, what may be tried."""
-    problem, words = sampler.problem, str(best.result["reason"])
-    if best.verified is not None:
-        figures = cast("VerifiedDesign", best.verified).design.figures
-        missed = " and ".join(missed_bounds(problem.inner, figures))
-        parts = [words, missed, remedies(problem, share) if missed else ""]
-        return "; ".join(part for part in parts if part)
-    where = ""
-    if sampler.nearest is not None and np.isfinite(sampler.nearest.violation):
-        where = f"nearest at {named_values(plant_of(problem).names, sampler.nearest.theta)}: "
-    thetas = len({entry.theta for entry in sampler.trace})
-    return f"{search_words(problem, thetas)}; {where}{words}; {remedies(problem, share)}"
-
-
-def search_words(problem: CoDesignProblem, thetas: int) -> str:
-    """Describe which controllers were searched, and where."""
-    inner, robust = problem.inner, problem.robust
-    ranges = (("omega_S", inner.omega_S), ("omega_T", inner.omega_T))
-    box = [f"{name} {low / HZ:g} to {high / HZ:g}" for name, (low, high) in ranges]
-    made = ""
-    if robust is not None and robust.shift:
-        ends = {"low": "its lower end", "nominal": "its middle", "high": "its upper end"}
-        places = [ends[choice.robust.design_at] for choice in design_choices(problem)
-                  if choice.robust]  # fmt: skip
-        named = " and ".join(filter(None, (", ".join(places[:-1]), places[-1])))
-        made = f", made on the plant at {named} of +-{100 * robust.shift:g} %"
-    return (
-        f"none found among the mixed-sensitivity H-infinity controllers{made} at {thetas} theta "
-        f"({', '.join(box)} Hz)"
-    )
-
-
-def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
-    """List what may be tried where none was found; `share` of the range that was held, if known."""
-    ways = ["wider bounds of theta, omega_S_hz or omega_T_hz", "a larger S_max or S_low"]
-    robust = problem.robust
-    if robust is not None:
-        narrower = "a narrower range in [robust]"
-        if share:
-            held = f"+-{100 * share * robust.shift:.3g} %" if robust.shift else f"{share:.2g} of it"
-            narrower += f" ({held} was held on the way)"
-        ways.append(narrower)
-    ways.append("another kind of controller (`robustness --controller` judges any)")
-    return f"one may exist all the same; try {', '.join(ways[:-1])}, or {ways[-1]}"

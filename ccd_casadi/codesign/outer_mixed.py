@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, isfinite
 from operator import call
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
@@ -32,11 +32,12 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verdict import Check, OwnSet, State
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.objective import binding, final_design, objective
-from ccd_casadi.inner_problem.problem import box, plant_of
-from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, design_choices, plant_of
+from ccd_casadi.inner_problem.sweep import active_constraints, missed_bounds
 from ccd_casadi.optim.pieces import Box
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.plant import hardware_cost, named_values
 from ccd_casadi.sampling.inner_samples import InnerSample
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import results
 from ccd_casadi.support.terminal import Progress
@@ -264,8 +265,6 @@ class MixedOuter(Outer):
     def failure_reason(self, solution: Solution, share: float | None) -> str:
         if solution.result["status"] == "verified":
             return str(solution.result["reason"])
-        from ccd_casadi.codesign.design_plants import failure_words  # where a search failed
-
         return failure_words(self.sampler, solution, share)
 
     def verify(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:
@@ -308,3 +307,50 @@ class MixedOuter(Outer):
         from ccd_casadi.codesign.post_optimal import post_optimal
 
         return post_optimal(self.problem, x, self.sampler.quiet)
+
+
+def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
+    """Describe why a search failed: where it searched, how near it came, what may be tried."""
+    problem, words = sampler.problem, str(best.result["reason"])
+    if best.verified is not None:
+        figures = cast(VerifiedDesign, best.verified).design.figures
+        missed = " and ".join(missed_bounds(problem.inner, figures))
+        parts = [words, missed, remedies(problem, share) if missed else ""]
+        return "; ".join(part for part in parts if part)
+    where = ""
+    if sampler.nearest is not None and np.isfinite(sampler.nearest.violation):
+        where = f"nearest at {named_values(plant_of(problem).names, sampler.nearest.theta)}: "
+    thetas = len({entry.theta for entry in sampler.trace})
+    return f"{search_words(problem, thetas)}; {where}{words}; {remedies(problem, share)}"
+
+
+def search_words(problem: CoDesignProblem, thetas: int) -> str:
+    """Describe which controllers were searched, and where."""
+    inner, robust = problem.inner, problem.robust
+    ranges = (("omega_S", inner.omega_S), ("omega_T", inner.omega_T))
+    ends_hz = [f"{name} {low / HZ:g} to {high / HZ:g}" for name, (low, high) in ranges]
+    made = ""
+    if robust is not None and robust.shift:
+        ends = {"low": "its lower end", "nominal": "its middle", "high": "its upper end"}
+        places = [ends[choice.robust.design_at] for choice in design_choices(problem)
+                  if choice.robust]  # fmt: skip
+        named = " and ".join(filter(None, (", ".join(places[:-1]), places[-1])))
+        made = f", made on the plant at {named} of +-{100 * robust.shift:g} %"
+    return (
+        f"none found among the mixed-sensitivity H-infinity controllers{made} at {thetas} theta "
+        f"({', '.join(ends_hz)} Hz)"
+    )
+
+
+def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
+    """List what may be tried where none was found; `share` of the range that was held, if known."""
+    ways = ["wider bounds of theta, omega_S_hz or omega_T_hz", "a larger S_max or S_low"]
+    robust = problem.robust
+    if robust is not None:
+        narrower = "a narrower range in [robust]"
+        if share:
+            held = f"+-{100 * share * robust.shift:.3g} %" if robust.shift else f"{share:.2g} of it"
+            narrower += f" ({held} was held on the way)"
+        ways.append(narrower)
+    ways.append("another kind of controller (`robustness --controller` judges any)")
+    return f"one may exist all the same; try {', '.join(ways[:-1])}, or {ways[-1]}"

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from oracles.helpers import problem
 
-from ccd_casadi.codesign.design_plants import remedies, search_words, widen
+from ccd_casadi.codesign.design_plants import widen
 from ccd_casadi.codesign.optimality import TrueDesign
+from ccd_casadi.codesign.outer_mixed import remedies, search_words
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import best_choice, design_choices, true_design, true_inner
 from ccd_casadi.inner_problem.sweep import missed_bounds, missed_by, shortfall
