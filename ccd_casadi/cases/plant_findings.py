@@ -163,15 +163,17 @@ def rest_findings(problem: CoDesignProblem, points: Sequence[Sequence[float]]) -
     start = uncertain_plant(problem, points[0])
     corners = start.corners()
     found = [start.plant(point, option).held_compliance for option, point in corners]
-    option, point = corners[int(np.argmax(found))]
+    if np.isnan(found).all():  # u holds the sensor at rest nowhere: nothing is claimed
+        return []
+    option, point = corners[int(np.nanargmax(found))]
     moved = np.array([
-        max(found),
+        np.nanmax(found),
         *(uncertain_plant(problem, at).plant(point, option).held_compliance for at in points[1:]),
     ])  # fmt: skip
-    over, least = moved > most, int(moved.argmin())
+    over, least = moved > most, int(np.nanargmin(moved))
     if not over.any():
         return []
-    worst = 0 if over[0] else int(moved.argmax())
+    worst = 0 if over[0] else int(np.nanargmax(moved))
     unit = spoken("m/N").removeprefix(spoken("m"))
 
     def size(value: float) -> str:
