@@ -144,23 +144,29 @@ def test_what_was_not_finished_is_not_taken_for_finished(
 
 
 def test_two_programs_do_not_compile_the_same(
-    empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    empty: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started, go, required = threading.Event(), threading.Event(), []
+    started, waits, go = threading.Event(), threading.Event(), threading.Event()
+    required: list[object] = []
 
     def slowly(*reported: object) -> bool:
         required.append(reported[-1])
         started.set()
         return go.wait(30.0)
 
+    def hear(words: str) -> None:
+        if "waiting" in words:
+            waits.set()
+
     monkeypatch.setattr(compilation, "_compile", slowly)
+    monkeypatch.setattr(compilation, "_say", hear)
     first = threading.Thread(target=compilation.ensure_compiled)
     second = threading.Thread(target=compilation.ensure_compiled)
     first.start()
     assert started.wait(30.0)
     second.start()
-    while "waiting" not in capsys.readouterr().err:
-        assert second.is_alive()
+    assert waits.wait(20.0)
+    assert second.is_alive()
     go.set()
     first.join(30.0)
     second.join(30.0)
