@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 
 from ccd_casadi.analysis import MOTOR_LIMITS, MoveLimits
-from ccd_casadi.analysis.move import forward_force
-from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
+from ccd_casadi.analysis.feedforward import feedforward_slopes, forward_force
+from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.fixed_parameters import reparametrise
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes

@@ -1,4 +1,4 @@
-"""A move of the stage: the plant driven by a setpoint, with feedforward, and when it settles."""
+"""A move of the stage: the plant driven by a setpoint, and when it settles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.setpoint import Setpoint, feedforward
+from ccd_casadi.analysis.feedforward import held_setpoint
+from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.ports import BreakPoint, course
-from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
+from ccd_casadi.lti.ports import course
+from ccd_casadi.lti.state_space import ClosedLoop, closed_loop
 from ccd_casadi.support.arrays import Array, states
-from ccd_casadi.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -182,86 +182,6 @@ class Move:
         return np.sqrt(np.tensordot(spans / spans.sum(), signal[where] ** 2, 1))
 
 
-def forward_gains(
-    forward: Array | None, inputs: int, reference: Array, axis: int,
-    places: Sequence[BreakPoint] = (),
-) -> Array:  # fmt: skip
-    """Select the feedforward of one output.
-
-    Parameters
-    ----------
-    forward : array (5, m, p) or None
-        Of `forward_of`; None: there is none.
-    inputs : int
-        m.
-    reference : array (p,)
-        As of `course`.
-    axis : int
-        The output, from 0.
-    places : sequence of BreakPoint
-        Of several sensors on one actuator; else empty.
-
-    Returns
-    -------
-    array (5, m)
-        F of `forward_force`, 0 without any.
-    """
-    if forward is None:
-        return np.zeros((5, inputs))
-    return np.asarray(forward @ reference if places else forward[:, :, axis])
-
-
-def forward_of(
-    plant: StateSpace, period: float, delay: float, places: Sequence[BreakPoint]
-) -> Array:
-    """Compute `feedforward` of a plant that may have several sensors on its actuator.
-
-    Parameters
-    ----------
-    plant : StateSpace
-        SI.
-    period, delay : float
-        s.
-    places : sequence of BreakPoint
-        Of several sensors on one actuator; else empty.
-
-    Returns
-    -------
-    array (5, m)
-        F of `feedforward`; of several sensors (5, p) of the output that counts, in the column of
-        each sensor its share in that.
-    """
-    if not places:
-        return feedforward(plant, period, delay)
-    row = np.array([places[0].output])
-    return feedforward(replace(plant, C=row @ plant.C, D=row @ plant.D), period, delay) * row
-
-
-def feedforward_of(loop: Loop, axis: int) -> Array | None:
-    """Compute the feedforward of one output of a loop as it runs, that of `solve` and `deploy`.
-
-    Parameters
-    ----------
-    loop : Loop
-        SI.
-    axis : int
-        The output, from 0.
-
-    Returns
-    -------
-    array (5, m) or None
-        F of `forward_force`; None where the plant has none.
-    """
-    run = loop.sampling
-    hold = (0.0, 0.0) if run is None else (run.period, run.delay)
-    try:
-        forward = forward_of(loop.plant, *hold, loop.at)
-    except UserError:
-        return None
-    reference = course(loop.plant, axis, loop.at)[1]
-    return forward_gains(forward, loop.plant.B.shape[1], reference, axis, loop.at)
-
-
 def moves(
     loops: Sequence[Loop],
     ways: Sequence[Array | None],
@@ -422,53 +342,3 @@ def _switch(
         for start, end in pairwise([k * step, *inside, (k + 1) * step]):
             A, drive = _over(loop, ahead, reference, end - start)
             driven[k] = A @ driven[k] + drive @ profile.at(np.array([start]))[:, 0]
-
-
-def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
-    """Sample r and four derivatives as `feedforward` takes them, for a force that is held.
-
-    Of each derivative the mean over a period about the instant, (r^(i-1)(t + T/2) -
-    r^(i-1)(t - T/2))/T: a snap that jumps between two instants is felt in its share.
-
-    Parameters
-    ----------
-    profile : Setpoint
-    time : array (N,)
-        s.
-    period : float
-        T in s.
-
-    Returns
-    -------
-    array (5, N)
-        r in m and its derivatives in m/s^i.
-    """
-    r, half = profile.at(time), 0.5 * period
-    r[1:] = (profile.at(time + half)[:4] - profile.at(time - half)[:4]) / period
-    return r
-
-
-def forward_force(
-    profile: Setpoint, forward: Array, time: Array, period: float
-) -> tuple[Array, Array]:
-    """Compute the setpoint and the force ahead that is held for a period from each instant on.
-
-    Parameters
-    ----------
-    profile : Setpoint
-    forward : array (5, m)
-        F of `feedforward`, N per unit of y and s.
-    time : array (N,)
-        s.
-    period : float
-        s.
-
-    Returns
-    -------
-    r : array (N,)
-        In the unit of y.
-    force : array (N, m)
-        F_0 r + Σ_i F_i mean r^(i), N.
-    """
-    r = held_setpoint(profile, time, period)
-    return r[0], r.T @ forward

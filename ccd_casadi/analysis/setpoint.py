@@ -1,15 +1,12 @@
 """Setpoints of fourth order, and the feedforward of them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -124,122 +121,3 @@ def _longest(*bounds: Any) -> Any:
     """The longest time within all bounds; zero where one of them is negative."""
     time = min(bounds, key=np.real)
     return time if np.real(time) > 0.0 else 0.0 * time
-
-
-@dataclass(frozen=True)
-class FeedforwardOptions:
-    """Numbers of the feedforward.
-
-    Attributes
-    ----------
-    order : int
-        Highest derivative of the setpoint.
-    points : int
-        On the circle of Cauchy's integral.
-    radius : float
-        Of the circle, over the nearest singularity of the inverse.
-    rounding : float
-        Of the inverse on the circle: a coefficient that is less there is 0.
-    slow : float
-        Over the slowest pole: where inputs are shared among more of them than outputs.
-    """
-
-    order: int = 4
-    points: int = 64
-    radius: float = 0.25
-    rounding: float = 1e-11
-    slow: float = 1e-3
-
-
-def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
-    """Gains of the feedforward of a setpoint, u = F_0 r + Σ_i F_i mean r^(i), as `forward_force`.
-
-    A force that is held for a period has to be the mean of what is needed over it, which a jerk or
-    snap that jumps inside makes of the means of the derivatives. With x = sT/2 hold and mean are
-    sinh(x)/x each, so that y = r at the instants up to s⁴ by the Taylor coefficients of
-
-        F_0 + Σ_i F_i s^i sinh(x)/x = e^(s(τ + T/2)) x/sinh(x) G(s)⁻¹
-
-    by Cauchy's integral on a circle within which it is analytic: its aliasing error is
-    radius^(points - order). Free bodies have F_0 = 0, without dampers F_1 = 0.
-
-    Parameters
-    ----------
-    plant : StateSpace
-        m inputs and p <= m outputs, SI.
-    period, delay : float
-        s.
-
-    Returns
-    -------
-    (order + 1, m, p) array
-        N per unit of y and s.
-
-    Raises
-    ------
-    UserError
-        The plant has a zero at s = 0: no finite force holds a position; or more outputs than
-        inputs.
-    """
-    share = _allocation(plant)
-    square = replace(plant, B=plant.B @ share, D=plant.D @ share)
-    return np.asarray(share @ feedforward_slopes(square, (), period, delay)[0])
-
-
-def _allocation(plant: StateSpace, options: FeedforwardOptions = FeedforwardOptions()) -> Array:
-    """The inputs (m, p) that move each output alone when slow, with the least forces: constants, so
-    that the inverse of what they leave is analytic."""
-    (_, m), p = plant.B.shape, len(plant.C)
-    if p > m:
-        raise UserError(f"the plant has {p} outputs and {m} inputs: no feedforward moves one alone")
-    if p == m:
-        return np.eye(m)
-    poles = np.abs(plant.poles)
-    moving = poles[poles > options.rounding * poles.max()]
-    slow = options.slow * moving.min(initial=np.inf)
-    return np.linalg.pinv(plant.response(np.array([slow if moving.size else 1.0]))[0].real)
-
-
-def feedforward_slopes(
-    plant: StateSpace,
-    changes: Sequence[tuple[Array, Array, Array]],
-    period: float,
-    delay: float,
-    options: FeedforwardOptions = FeedforwardOptions(),
-) -> tuple[Array, Array]:
-    """F, and dF (k, order + 1, m, p) of k changes (dA, dB, dC) of a square plant.
-
-    dG⁻¹ = -G⁻¹ dG G⁻¹
-    """
-    count, terms = options.points, options.order + 1
-    poles = np.abs(plant.poles)
-    fastest = float(poles.max())  # 0 of masses alone, whose inverse is analytic everywhere
-    nearest = min([*np.abs(plant.zeros(fastest or 1.0)), fastest or np.inf])
-    if not nearest > 1e-9 * fastest:
-        raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
-    late = delay + 0.5 * period
-    stays = 1.0 / late if late > 0.0 else max(fastest, 1.0)  # where exp stays of size one
-    radius = min(options.radius * nearest, stays)
-    s = radius * np.exp(2j * np.pi * np.arange(count) / count)
-    X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
-    G = plant.C @ X + plant.D
-    inverse = np.linalg.inv(G)
-    x = 0.5 * period * s
-    hold = (x / np.sinh(x) if period else np.ones_like(s))[:, None, None]
-    ahead = hold * np.exp(s * late)[:, None, None]
-
-    def series(values: np.ndarray) -> Array:
-        first = (ahead * values).mean(axis=0)  # of r itself, which is not a mean
-        found = np.fft.fft(hold * (ahead * values - first), axis=0).real[:terms] / count
-        found[0] += first.real
-        size = np.abs(values).max(axis=0)
-        size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
-        found[np.abs(found) <= options.rounding * size] = 0.0
-        return np.asarray(found / radius ** np.arange(terms)[:, None, None])
-
-    F, dF = series(inverse), np.zeros((len(changes), terms, *inverse.shape[1:]))
-    for i, (dA, dB, dC) in enumerate(changes):
-        whole = s[:, None, None] * np.eye(len(poles)) - plant.A
-        dG = dC @ X + plant.C @ np.linalg.solve(whole, dA @ X + dB)
-        dF[i] = series(-inverse @ dG @ inverse)
-    return F, dF

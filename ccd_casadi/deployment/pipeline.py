@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.feedforward import forward_of
 from ccd_casadi.analysis.loop_channels import (
     LoopChannel,
     along_directions,
@@ -14,7 +15,6 @@ from ccd_casadi.analysis.loop_channels import (
     scalar_channels,
     whole_loop,
 )
-from ccd_casadi.analysis.move import forward_of
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis import LIMITS
+from ccd_casadi.analysis.feedforward import feedforward_of, forward_force
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.move import Move, feedforward_of, forward_force, moves
+from ccd_casadi.analysis.move import Move, moves
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
