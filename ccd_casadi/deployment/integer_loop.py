@@ -9,7 +9,8 @@ import numpy as np
 from ccd_casadi.analysis.feedforward import forward_force, forward_gains
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.codesign.reasons import Finding, Reason
-from ccd_casadi.deployment.fixed_point import FixedPoint, Ranges, Term
+from ccd_casadi.deployment.fixed_point import Ranges
+from ccd_casadi.deployment.integer_equation import FixedPoint, Term
 from ccd_casadi.deployment.on_hardware import UNLIMITED, OnHardware
 from ccd_casadi.lti.ports import BreakPoint, course
 from ccd_casadi.lti.state_space import StateSpace, closed_loop

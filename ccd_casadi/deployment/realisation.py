@@ -4,18 +4,16 @@ saturates."""
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
 from ccd_casadi.analysis.loop_channels import LoopChannel
+from ccd_casadi.deployment.integer_equation import FixedPoint
 from ccd_casadi.lti.state_space import StateSpace, balance_system
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-
-if TYPE_CHECKING:
-    from ccd_casadi.deployment.fixed_point import FixedPoint
 
 
 def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace]) -> StateSpace:
@@ -55,7 +53,7 @@ class Realisation:
     saturation: float | None = None
     back_calculation: Array | None = None
     single: bool = False
-    fixed: "FixedPoint | None" = None
+    fixed: FixedPoint | None = None
 
     @property
     def precision(self) -> str:
