@@ -113,15 +113,21 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         say(f"note: {words}", sys.stderr)
 
 
-def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
-    """The solution, a failed one's reason with what looks like a wrong unit, sign or loop."""
-    if solution.result["status"] == "verified":
+def with_causes(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
+    """The solution, a failed one's reason with what looks like a wrong unit, sign or loop; and with
+    what a larger budget does, unless no examined theta can meet a bound."""
+    result = solution.result
+    if result["status"] == "verified":
         return solution
-    from ccd_casadi.cases.diagnosis import suspicions
+    from ccd_casadi.cases.diagnosis import diagnose, suspicions
+    from ccd_casadi.codesign.reasons import Reason
 
-    causes = suspicions(problem, case.suspension.rigid_modes)
-    words = "; ".join(filter(None, [solution.result["reason"], *causes]))
-    return replace(solution, result=solution.result | {"reason": words})
+    designed, modes = result["status"] != "infeasible", case.suspension.rigid_modes
+    words = [result["reason"], *suspicions(problem, modes, designed=designed)]
+    if not designed and result.get("time_budget", {}).get("ended"):
+        impossible = any(item.everywhere for item in diagnose(problem, modes)[1])
+        words += [] if impossible else [Reason.LARGER_BUDGET().words()]
+    return replace(solution, result=result | {"reason": "; ".join(filter(None, words))})
 
 
 def of_workers(options: argparse.Namespace) -> Sequence[str]:
@@ -179,7 +185,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             minutes = options.budget or case.outer.minutes
             found = within(minutes, sampler, formulation, options.seed)
-            solution = with_units(found, case, problem)
+            solution = with_causes(found, case, problem)
             write_run(folder, case, solution)
         code = ExitCode.of(solution.result["status"])
         inform(summary(solution))

@@ -205,21 +205,28 @@ def _unused_parameters(
     return found
 
 
-def suspicions(problem: CoDesignProblem, rigid_modes: int | None = None) -> list[str]:
-    """List likely causes where no design is found: numbers in another unit, a sign, the loop.
+def suspicions(
+    problem: CoDesignProblem, rigid_modes: int | None = None, *, designed: bool = False
+) -> list[str]:
+    """List likely causes where no design is found: numbers in another unit, a sign, the loop, an
+    unstable pole of the plant.
 
     Parameters
     ----------
     problem : CoDesignProblem
     rigid_modes : int, optional
         Number of rigid-body modes that is expected.
+    designed : bool
+        Whether there is a design, which is not verified: it stabilises the plant.
 
     Returns
     -------
     list of str
     """
     found = diagnose(problem, rigid_modes)[1]
-    return [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
+    words = [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
+    unstable = [item.words for item in found if item.topic is Topic.UNSTABLE]
+    return words if designed else [*words, *unstable[:1]]
 
 
 def first_seen(findings: Sequence[CaseFinding]) -> list[CaseFinding]:

@@ -92,7 +92,8 @@ class Topic(StrEnum):
 class CaseFinding:
     """One sentence about the plant; `index` of the θ where it was seen, among those looked at.
 
-    `limit_hz`: the bandwidth above which none is possible there.
+    `limit_hz`: the bandwidth above which none is possible there. `everywhere`: no examined θ admits
+    a design.
     """
 
     severity: Severity
@@ -100,6 +101,7 @@ class CaseFinding:
     words: str
     index: int = 0
     limit_hz: float = np.inf
+    everywhere: bool = False
 
 
 def unit_findings(
