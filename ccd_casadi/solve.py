@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.reporting.decision import advice
+    from ccd_casadi.reporting.decision import decide
     from ccd_casadi.reporting.facts import (
         channel_words,
         cost_words,
@@ -46,7 +46,7 @@ def summary(solution: "Solution") -> str:
         moved = sampled_words(made, r["verdict"]["deployable"].get("rate_hz"))
         sections = [*(item.text for item in made), *filter(None, [moved])]
     return words.render(
-        r=r, decision=advice(r), verdict=terminal_lines(r), details=detail_lines(r),
+        r=r, decision=decide(r), verdict=terminal_lines(r), details=detail_lines(r),
         theta=theta_words(r), hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
         sections=sections,
         loop_lines=loop_lines(r), required=requirement_lines(r),

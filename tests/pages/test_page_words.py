@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.concerns import LINES
-from ccd_casadi.reporting.decision import advice
+from ccd_casadi.reporting.decision import advice, decide
 from ccd_casadi.reporting.facts import (
     facts,
     prediction_words,
@@ -204,7 +204,8 @@ def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
     assert bool(alone) == bool(said)
     if said:
         both = advice(result_of(predicted="warned", deployable="unknown") | figures)
-        assert f"predicted warned; {said}" in both
+        assert f"accept: {said}" in both
+        assert "; predicted warned" in both
         assert "Deploy it first" in both
         assert said not in advice(result_of(survives="failed") | figures)
 
@@ -227,7 +228,8 @@ def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
         assert words in said
         assert words not in bare
     assert said.startswith("Build this only if you accept: the bounds are not proven")
-    assert run_head("", result | poor, "", "").decision == said
+    head = run_head("", result | poor, "", "")
+    assert (head.decision, head.also) == (decide(result | poor).words, decide(result | poor).also)
 
 
 @pytest.mark.parametrize(
