@@ -197,7 +197,10 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     if not is_force(problem.spoken[1]):
         return [f"{words}: is M_K in another unit?"]
     undeclared = "; what is no force is declared in [units]" if problem.spoken[1] == "N" else ""
-    return [f"{words}: is the stiffness in another unit? {SI}{undeclared}"]
+    units = SI
+    if problem.spoken[0] == "rad":
+        units = f"It is in N m/rad: one per degree is {np.degrees(1.0):.3g} times smaller"
+    return [f"{words}: is the stiffness in another unit? {units}{undeclared}"]
 
 
 def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> list[str]:
