@@ -198,12 +198,12 @@ def _summary(
     from ccd_casadi.deployment.integer_loop import integer_words
     from ccd_casadi.deployment.outcome import DeployedRun
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.reporting.decision import advice
+    from ccd_casadi.reporting.decision import decide
     from ccd_casadi.support.text import template
 
     deployed = DeployedRun(run, found)
     return template("templates/deploy.txt", place_words=place_words).render(
-        d=found, status=deployed.status, decision=advice(judged),
+        d=found, status=deployed.status, decision=decide(judged),
         needed=needed_words(found), order=deployed.order, figures=deployed.rows,
         integers=integer_words(found.realisation.fixed, found.rounding, moved),
     ).rstrip()  # fmt: skip

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.reporting.decision import advice
+    from ccd_casadi.reporting.decision import decide
     from ccd_casadi.reporting.facts import (
         channel_words,
         cost_words,
@@ -46,7 +46,7 @@ def summary(solution: "Solution") -> str:
         moved = sampled_words(made, r["verdict"]["deployable"].get("rate_hz"))
         sections = [*(item.text for item in made), *filter(None, [moved])]
     return words.render(
-        r=r, decision=advice(r), verdict=terminal_lines(r), details=detail_lines(r),
+        r=r, decision=decide(r), verdict=terminal_lines(r), details=detail_lines(r),
         theta=theta_words(r), hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
         sections=sections,
         loop_lines=loop_lines(r), required=requirement_lines(r),
@@ -113,15 +113,21 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         say(f"note: {words}", sys.stderr)
 
 
-def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
-    """The solution, a failed one's reason with what looks like a wrong unit, sign or loop."""
-    if solution.result["status"] == "verified":
+def with_causes(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
+    """The solution, a failed one's reason with what looks like a wrong unit, sign or loop; and with
+    what a larger budget does, unless no examined theta can meet a bound."""
+    result = solution.result
+    if result["status"] == "verified":
         return solution
-    from ccd_casadi.cases.diagnosis import suspicions
+    from ccd_casadi.cases.diagnosis import diagnose, suspicions
+    from ccd_casadi.codesign.reasons import Reason
 
-    causes = suspicions(problem, case.suspension.rigid_modes)
-    words = "; ".join(filter(None, [solution.result["reason"], *causes]))
-    return replace(solution, result=solution.result | {"reason": words})
+    designed, modes = result["status"] != "infeasible", case.suspension.rigid_modes
+    words = [result["reason"], *suspicions(problem, modes, designed=designed)]
+    if not designed and result.get("time_budget", {}).get("ended"):
+        impossible = any(item.everywhere for item in diagnose(problem, modes)[1])
+        words += [] if impossible else [Reason.LARGER_BUDGET().words()]
+    return replace(solution, result=result | {"reason": "; ".join(filter(None, words))})
 
 
 def of_workers(options: argparse.Namespace) -> Sequence[str]:
@@ -179,7 +185,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             minutes = options.budget or case.outer.minutes
             found = within(minutes, sampler, formulation, options.seed)
-            solution = with_units(found, case, problem)
+            solution = with_causes(found, case, problem)
             write_run(folder, case, solution)
         code = ExitCode.of(solution.result["status"])
         inform(summary(solution))

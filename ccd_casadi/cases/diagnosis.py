@@ -205,21 +205,28 @@ def _unused_parameters(
     return found
 
 
-def suspicions(problem: CoDesignProblem, rigid_modes: int | None = None) -> list[str]:
-    """List likely causes where no design is found: numbers in another unit, a sign, the loop.
+def suspicions(
+    problem: CoDesignProblem, rigid_modes: int | None = None, *, designed: bool = False
+) -> list[str]:
+    """List likely causes where no design is found: numbers in another unit, a sign, the loop, an
+    unstable pole of the plant.
 
     Parameters
     ----------
     problem : CoDesignProblem
     rigid_modes : int, optional
         Number of rigid-body modes that is expected.
+    designed : bool
+        Whether there is a design, which is not verified: it stabilises the plant.
 
     Returns
     -------
     list of str
     """
     found = diagnose(problem, rigid_modes)[1]
-    return [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
+    words = [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
+    unstable = [item.words for item in found if item.topic is Topic.UNSTABLE]
+    return words if designed else [*words, *unstable[:1]]
 
 
 def first_seen(findings: Sequence[CaseFinding]) -> list[CaseFinding]:
@@ -254,10 +261,16 @@ class PlantReportOptions:
         with resonances nearby.
     shares : tuple of float
         Bandwidths over the first resonance, for each of which an M_K is given.
+    velocities : tuple of float
+        Velocity limits over the velocity that a move reaches, tried whether they shorten it.
+    shorter : float
+        Relative: by how much that is worth a line.
     """
 
     window: tuple[float, float] = (0.4, 1.1)
     shares: tuple[float, ...] = (0.2, 1.0 / 3.0, 0.5)
+    velocities: tuple[float, ...] = (0.9, 0.8)
+    shorter: float = 0.01
 
 
 def plant_report(
@@ -317,6 +330,7 @@ def plant_report(
             for name, value in constraints
         ],
         "move": _move(problem),
+        "slower_is_faster": _slower_velocity(problem, options),
         "budget": [  # each source by the RMS of its spectrum; None where it is white
             {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
             for s in (problem.budget.sources if problem.budget else ())
@@ -351,6 +365,32 @@ def _move(problem: CoDesignProblem) -> dict[str, Any] | None:
         "limits": list(cycle.limits), "peak_force": float(cycle.peak_force),
         "rms_force": float(cycle.rms_force), **of_motor,
     }  # fmt: skip
+
+
+def _slower_velocity(
+    problem: CoDesignProblem, options: PlantReportOptions
+) -> dict[str, float] | None:
+    """The velocity limit, of a few below what the move at the start reaches, that shortens it most,
+    and its duration; None where none does. Where heat limits, the setpoint is the fastest only of
+    its form: with a lower velocity the same heat accelerates harder."""
+    motion = problem.source.motion
+    if motion is None:
+        return None
+    try:
+        cycle = motion_of(problem, problem.start).cycle
+    except UserError:  # what designs a controller reports it
+        return None
+    if "heat" not in cycle.limits:
+        return None
+    made, reached = [], float(np.real(cycle.profile.velocity))
+    for share in options.velocities:
+        limits = replace(motion.limits, velocity=share * reached)
+        source = replace(problem.source, motion=replace(motion, limits=limits))
+        at = motion_of(replace(problem, source=source), problem.start)
+        made.append((at.cycle.profile.duration, share * reached))
+    duration, velocity = min(made)
+    worth = duration < (1.0 - options.shorter) * cycle.profile.duration
+    return {"velocity": velocity, "duration": duration} if worth else None
 
 
 def size_words(

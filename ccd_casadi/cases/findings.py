@@ -92,7 +92,8 @@ class Topic(StrEnum):
 class CaseFinding:
     """One sentence about the plant; `index` of the θ where it was seen, among those looked at.
 
-    `limit_hz`: the bandwidth above which none is possible there.
+    `limit_hz`: the bandwidth above which none is possible there. `everywhere`: no examined θ admits
+    a design.
     """
 
     severity: Severity
@@ -100,6 +101,7 @@ class CaseFinding:
     words: str
     index: int = 0
     limit_hz: float = np.inf
+    everywhere: bool = False
 
 
 def unit_findings(
@@ -195,7 +197,10 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOpt
     if not is_force(problem.spoken[1]):
         return [f"{words}: is M_K in another unit?"]
     undeclared = "; what is no force is declared in [units]" if problem.spoken[1] == "N" else ""
-    return [f"{words}: is the stiffness in another unit? {SI}{undeclared}"]
+    units = SI
+    if problem.spoken[0] == "rad":
+        units = f"It is in N m/rad: one per degree is {np.degrees(1.0):.3g} times smaller"
+    return [f"{words}: is the stiffness in another unit? {units}{undeclared}"]
 
 
 def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> list[str]:

@@ -192,7 +192,7 @@ def rest_findings(problem: CoDesignProblem, points: Sequence[Sequence[float]]) -
         "or stiffen what lies between sensor and performance"
     )
     severity = Severity.WARNING if over[0] else Severity.NOTE
-    return [CaseFinding(severity, Topic.LOOP, words)]
+    return [CaseFinding(severity, Topic.LOOP, words, everywhere=bool(over.all()))]
 
 
 def _sign_words(problem: CoDesignProblem, modal: ModalPlant, *, nothing: float = 1e-6) -> list[str]:
@@ -386,12 +386,12 @@ def driven_away_findings(facts: PlantFacts, of_states: bool, place: str) -> list
     growth = max((mode.growth_hz for mode in facts.modes), default=0.0)
     if not growth:
         return []
-    what = "the stiffness drives a motion away"
+    what, why = "the stiffness drives a motion away", " (a negative eigenvalue, as no spring makes)"
     meant = "a spring was meant, correct the sign of stiffness"
     if of_states:
-        what, meant = "A drives a motion away", "that is not meant, correct its signs"
+        what, why, meant = "A drives a motion away", "", "that is not meant, correct its signs"
     words = (
-        f"{what} {place}: an unstable pole at +{growth:.4g} Hz, which "
+        f"{what} {place}{why}: an unstable pole at +{growth:.4g} Hz, which "
         f"the crossover has to exceed; if {meant}"
     )
     return [CaseFinding(Severity.NOTE, Topic.UNSTABLE, words)]

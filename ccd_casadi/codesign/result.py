@@ -150,7 +150,9 @@ def of_budget(
     """
     own = {"time_budget": spent.entry, "phase_seconds": dict(seconds or {})}
     result = {**solution.result, **own}
-    ended = (Reason.BUDGET(**spent.entry), Reason.LARGER_BUDGET()) if spent.ended else ()
+    # without a design, whether more time helps depends on the plant: `solve` adds it
+    more = (Reason.LARGER_BUDGET(),) if "verdict" in result else ()
+    ended = (Reason.BUDGET(**spent.entry), *more) if spent.ended else ()
     words = "; ".join(one.words() for one in ended)
     if words and "verdict" in result:
         line = Check.read("optimal", result["verdict"]["optimal"])

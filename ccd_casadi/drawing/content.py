@@ -481,6 +481,8 @@ class Head:
     verdict : tuple of VerdictRow
     decision : str
         What to do next, in a sentence or two.
+    also : tuple of str
+        What the decision leaves out, a sentence each.
     own_decision : bool
         Whether it answers another question than whether to build the run's design.
     folded : bool
@@ -495,6 +497,7 @@ class Head:
     lead: str
     verdict: tuple[VerdictRow, ...] = ()
     decision: str = ""
+    also: tuple[str, ...] = ()
     own_decision: bool = False
     folded: bool = False
 

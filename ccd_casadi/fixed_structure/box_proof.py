@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.break_points import SensorFamily
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.enclosure import Enclosures, LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum, unmoved_words
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.wiring import OwnPorts
 from ccd_casadi.plants.plant import Mechanics
@@ -260,7 +260,8 @@ class Proof:
         Of a refuted box: where, the bound that it exceeds there and the least factor by which, by
         an enclosure and not by a sample.
     left : str
-        Which bounds the proof is not of, in words; empty: of every bound.
+        Which bounds the proof is not of, in words (empty: of every bound); where it does not apply
+        what of the plant is in its way.
     """
 
     outcome: ProofOutcome
@@ -302,7 +303,9 @@ class Proof:
     def unproven(self) -> str:
         """The reason why the proof does not apply, or is not of every bound; empty where it is of
         all."""
-        return self.left if self.applies else self.outcome.value
+        if self.applies:
+            return self.left
+        return self.outcome.value + (f": {self.left}" if self.left else "")
 
     @property
     def unclosed(self) -> bool:
@@ -329,7 +332,8 @@ class Proof:
         if self.outcome is ProofOutcome.UNSTABLE:
             return (f"the proof denies it: {self.outcome.value}",)
         if not self.stable:
-            return (f"searched, not proven: {self.outcome.value}",)
+            why = self.outcome.value if self.applies else self.unproven
+            return (f"searched, not proven: {why}",)
         left = (self.unproven,) if self.left else ()
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
@@ -399,7 +403,8 @@ def prove(
         bounds = replace(bounds, compliance_max=None)
     families = _families(uncertain, structure, kappa, bandwidth, bounds, sampling, options)
     if isinstance(families, ProofOutcome):
-        return Proof(families, slack, names)
+        why = unmoved_words(uncertain) if families is ProofOutcome.VARIES else ""
+        return Proof(families, slack, names, left=why)
     most, enough = (most_boxes or options.most_boxes) // len(families), None
     if many and most_boxes is None:
         most, enough = min(most, options.most_boxes_of_many), options.stuck_boxes_of_many

@@ -480,6 +480,31 @@ def modal_sum(
     return replace(alone, drive=one, reading=one, moving=moving) if known else None
 
 
+def unmoved_words(uncertain: UncertainPlant) -> str:
+    """Say why the modes of a plant with ranges are not enclosed (`modal_sum` is None), in a clause.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+
+    Returns
+    -------
+    str
+    """
+    for option, system in enumerate(uncertain.options):
+        modal, own = uncertain.modal(option), uncertain.own
+        outputs, inputs = (own.outputs, own.inputs) if own else (len(modal.C), modal.B.shape[1])
+        if uncertain.graph(option) is None:
+            return "its matrices are not made of expressions of theta alone"
+        if not system.damping_ratio:
+            return "it has no damping ratio"
+        if modal.driven_away.any():
+            return "its stiffness drives a motion away"
+        if outputs > 1 or inputs > 1:
+            return "it has several forces or sensors"
+    return "two of its modes meet, or its function has an operation that is not enclosed"
+
+
 def _least(f: Affine) -> Array:
     """Not above a real form anywhere."""
     return np.asarray(f.centre.real - np.abs(f.slope).sum(0) - f.rest)

@@ -9,6 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.analysis.motor import DrivenMechanics
 from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,
@@ -277,9 +278,14 @@ class Ranged:
         """The same as a function, where the plant is one."""
         count = len(structured_of(self.problem).uncertainty.ranges)
         evaluate, x = self.wider[option].evaluate, ca.SX.sym("x", count)
+        theta, driven, mass = self.theta, 0, 0.0
+        if isinstance(evaluate, DrivenMechanics):
+            driven, mass = evaluate.inputs, evaluate.mass(theta)
+            theta, evaluate = evaluate.own(theta), evaluate.evaluate
         if not isinstance(evaluate, FromExpressions):
             return None
-        M, D, K, B, C = evaluate.matrices.call([ca.vertcat(*self.theta, x)])[:5]
+        M, D, K, B, C = evaluate.matrices.call([ca.vertcat(*theta, x)])[:5]
+        M += mass * B[:, :driven] @ B[:, :driven].T
         if (own := bounded_ports(self.problem)[1]) is not None:
             B, C = B[:, : own.inputs], C[: own.outputs, :]
         return ca.Function("graph", [x], [M, D, K, B, C])

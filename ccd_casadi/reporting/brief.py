@@ -108,7 +108,8 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
     """The page as a document of its own, without scripts or requests."""
     result, problem = run.result, run.problem
     decided = decide(result)
-    decision = replace(decided, steps=()).words or "Not judged."  # the steps end the page
+    first = replace(decided, steps=())  # which end the page
+    decision, also = first.words or "Not judged.", first.also
     clear = decided.build is Build.YES and not decided.condition
     colour = "bad" if decided.refuses else "good" if clear else "warn"
     view = run_view(run)
@@ -124,8 +125,8 @@ def brief_html(run: FinishedRun, options: BriefOptions = BriefOptions()) -> str:
         limits=_limits(problem, result)[: options.limits],
         ifs=list(what_if(result, options.shift, options.gain)),
         risks=risks(result)[: options.risks],
-        notes=(_checks(result), f"Next: {_next(decided, result)}.", evidence(result),
-               _reproduce(run)),
+        notes=(*([f"Also: {' '.join(also)}"] if also else []), _checks(result),
+               f"Next: {_next(decided, result)}.", evidence(result), _reproduce(run)),
     )  # fmt: skip
 
 

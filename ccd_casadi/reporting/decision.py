@@ -5,9 +5,10 @@ are rendered from these and never read back. It rests on the five lines of the v
 `concerns`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import accumulate
 from typing import Any
 
 from ccd_casadi.codesign.reasons import Reason
@@ -91,12 +92,20 @@ SENTENCES = {
 
 
 @dataclass(frozen=True)
+class DecisionOptions:
+    """What the first paragraph of a page, and of the terminal, has of a decision."""
+
+    most_reasons: int = 3
+    most_words: int = 50
+
+
+@dataclass(frozen=True)
 class Decision:
     """Whether to build a design."""
 
     build: Build
     concerns: tuple[Concern, ...] = ()  # the first is the most important
-    steps: tuple[str, ...] = ()  # what to do next
+    steps: tuple[str, ...] = ()  # what to do next, in the order of the concerns
     beside: tuple[Concern, ...] = ()  # what else speaks against a design that must not be built
     unjudged: bool = False  # hold and delay are not judged yet
     condition: str = ""  # what must be known of the resonances, in a sentence; empty: nothing
@@ -104,13 +113,37 @@ class Decision:
 
     @property
     def words(self) -> str:
-        """The decision in a sentence or two, for terminal and pages."""
-        parts = [SENTENCES[self.build].format("; ".join(one.words for one in self.concerns))]
-        parts += [f"Besides, {one.words}." for one in self.beside]
-        parts += [f"Next: {'; '.join(self.steps)}."] if self.steps else []
+        """The decision with its strongest reasons, for terminal and pages."""
+        return " ".join(self._split()[0])
+
+    @property
+    def also(self) -> tuple[str, ...]:
+        """What the words leave out, a sentence each."""
+        return tuple(self._split()[1])
+
+    def _split(self, options: DecisionOptions = DecisionOptions()) -> tuple[list[str], list[str]]:
+        """The sentences of the first paragraph, and the others: of reasons and steps the first is
+        always in it, and never a later one without those before."""
+        most = options.most_words
+        sentence = SENTENCES[self.build]
+        reasons = [one.words for one in self.concerns]
+        count = _fitting(reasons, most - _length(sentence))
+        count = max(min(count, options.most_reasons), 1)
+        first = [sentence.format("; ".join(reasons[:count]))]
+        first += [f"Besides, {one.words}." for one in self.beside]
+        last = [self.condition] if self.condition else []
         if self.unjudged and self.build is Build.IF_ACCEPTED:
-            parts.append("Deploy it first: hold and delay are not judged yet.")
-        return " ".join(part for part in (*parts, self.condition, *self.remarks) if part)
+            last.insert(0, "Deploy it first: hold and delay are not judged yet.")
+        left = most - _length(*first, *last, "Next:")
+        ahead = max(_fitting(self.steps, left), 1)
+        if self.steps:
+            first.append(f"Next: {'; '.join(self.steps[:ahead])}.")
+            left -= _length(first[-1])
+        shown = 0 if len(reasons) > count else _fitting(self.remarks, left)
+        rest = [f"{words}." for words in reasons[count:]]
+        rest += [f"Then: {'; '.join(self.steps[ahead:])}."] if self.steps[ahead:] else []
+        first = [words for words in first if words]
+        return [*first, *last, *self.remarks[:shown]], [*rest, *self.remarks[shown:]]
 
     @property
     def builds(self) -> bool:
@@ -121,6 +154,16 @@ class Decision:
     def refuses(self) -> bool:
         """Whether the design must not be built, or not yet."""
         return self.build in (Build.NO, Build.NOT_YET, Build.NOT_VERIFIED)
+
+
+def _length(*texts: str) -> int:
+    return sum(len(text.split()) for text in texts)
+
+
+def _fitting(texts: Sequence[str], most: int) -> int:
+    """How many of the first texts have at most this many words together."""
+    held = list(accumulate(map(_length, texts)))
+    return sum(count <= most for count in held)
 
 
 def decide(result: Mapping[str, Any]) -> Decision:
@@ -162,25 +205,27 @@ def decide(result: Mapping[str, Any]) -> Decision:
             return Decision(against[concern.reason], (concern,), (step,), beside)
     if move:
         return Decision(Build.NOT_YET, beside, (limited_move_remedy(result),))
-    warned = [
-        _warning(Check.read(name, result["verdict"][name]))
+    warned = {
+        name: _warning(Check.read(name, result["verdict"][name]))
         for name, state in states.items()
         if state == State.WARNED and name != "survives"
-    ]
-    searched = [one for one in survival if one.reason is ConcernKind.SET_SEARCHED]
-    weighed = [one for one in survival if one.reason is not ConcernKind.SET_SEARCHED]
+    }
+    of_search = [warned.pop(name) for name in BOUNDS_KEPT if name in warned]
     missed = [Concern(*BOUNDS_KEPT[name][1:]) for name in kept]
-    concerns = [*missed, *weighed, *warned, *searched]
     budget = result.get("time_budget", {})
     if budget.get("ended"):
         words = f"the search was ended by its budget of {budget['minutes']:g} min"
         if "share" in budget:
             words += f" ({100.0 * budget['share']:.3g} % of it are for the search)"
-        concerns.append(Concern(ConcernKind.BUDGET, words))
+        of_search.append(Concern(ConcernKind.BUDGET, words))
     elif states.get("optimal") == State.UNKNOWN:
         words = "whether it is an optimum is not known"
-        concerns.append(Concern(ConcernKind.LINE_UNKNOWN, words))
-    concerns += loop_concerns(result)
+        of_search.append(Concern(ConcernKind.LINE_UNKNOWN, words))
+    # the machine first, then what is not known of its bounds, then what a longer search may change
+    loop = loop_concerns(result)
+    motor = [one for one in loop if one.reason in (ConcernKind.CURRENT, ConcernKind.HEAT)]
+    loop = [one for one in loop if one not in motor]
+    concerns = [*missed, *motor, *survival, *warned.values(), *loop, *of_search]
     unjudged = states.get("deployable") == State.UNKNOWN
     condition, besides = resonance_condition(result), remarks(result)
     if not concerns:
@@ -196,14 +241,14 @@ def decide(result: Mapping[str, Any]) -> Decision:
         ConcernKind.BETWEEN_LINES: "loop",
         ConcernKind.BUDGET: "budget",
     }
-    present = {one.reason for one in concerns}
     next_ = NEXT | {"unproven": open_bound(result).remedy or NEXT["unproven"]}
-    steps = tuple(dict.fromkeys(next_[name] for why, name in remedies.items() if why in present))
+    named = (remedies[one.reason] for one in concerns if one.reason in remedies)
+    steps = tuple(dict.fromkeys(next_[name] for name in named))
     return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition, besides)
 
 
 def advice(result: Mapping[str, Any]) -> str:
-    """Write the decision on a design (`decide`) in words.
+    """Write all of the decision on a design (`decide`) in words.
 
     Parameters
     ----------
@@ -215,7 +260,8 @@ def advice(result: Mapping[str, Any]) -> str:
     str
         Empty where there is nothing to decide.
     """
-    return decide(result).words
+    found = decide(result)
+    return " ".join([found.words, *(["Also:", *found.also] if found.also else [])])
 
 
 def _decide_loop(result: Mapping[str, Any]) -> Decision:

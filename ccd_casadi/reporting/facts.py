@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import UndefinedError
 
 from ccd_casadi.analysis import MOTOR_LIMITS
+from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
@@ -174,6 +175,40 @@ def requirements_table(result: Mapping[str, Any]) -> Table:
     """The requirements, what is achieved, and what is left of each."""
     head = ("requirement", "at most, or at least", "achieved", "margin", "where", "known by")
     return Table(head, tuple(_requirement_rows(result)))
+
+
+def margins_table(result: Mapping[str, Any], plants: int) -> tuple[Table, ...]:
+    """Margins of the model beside those of the worst plant, each on its own.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    plants : int
+        That the loop is designed on.
+
+    Returns
+    -------
+    tuple of Table
+        Empty of the model alone, and where one of them is not known.
+    """
+    model = at_solve(result, "survives")
+    if plants < 2 or "phase_margin_deg" not in result or "gain_margin" not in model:
+        return ()
+    down, up = model["gain_margin"]
+    late = at_solve(result, "deployable").get("delay_margin")
+    factors = [x for x in (up, 1.0 / down if down else None) if x is not None]
+    rows = (
+        ("phase", "°", model["phase_margin_deg"], result["phase_margin_deg"]),
+        ("gain, × or ÷", "", min(factors, default=None), result["gain_margin"]),
+        ("delay", " µs", None if late is None else 1e6 * late, result["delay_margin_us"]),
+        ("modulus", "", model["modulus_margin"], result["modulus_margin"]),
+    )
+    shown = tuple(
+        (name, *("unlimited" if x is None else f"{number(x, 3)}{unit}" for x in pair))
+        for name, unit, *pair in rows
+    )
+    return (Table(("margin", "model", f"worst of the {plants} plants designed on"), shown),)
 
 
 def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -13,7 +13,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page
 from ccd_casadi.drawing.paint import page_html, update_pages, write_page
 from ccd_casadi.reporting.concerns import lines_of, loop_concerns, why_unproven, worst_state
-from ccd_casadi.reporting.decision import advice
+from ccd_casadi.reporting.decision import decide
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import columns, wrap
@@ -79,10 +79,9 @@ def head_of(
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
     clean &= why_unproven(result) is None
     badge = "bad" if not good else "good" if clean else "warn"
-    own = bool(decision)
-    decision = decision or advice(result)
-    lines = lines_of(result)
-    return Head(title, badge, status, reason, meta, lead, lines, decision, own, folded=True)
+    own, found, lines = bool(decision), decide(result), lines_of(result)
+    words, also = (decision, ()) if own else (found.words, found.also)
+    return Head(title, badge, status, reason, meta, lead, lines, words, also, own, folded=True)
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
@@ -216,7 +215,7 @@ def write_index(folder: Path) -> None:
         if head.verdict:
             head = replace(head, verdict=whole.verdict)
         if head.decision and not head.own_decision:
-            head = replace(head, decision=whole.decision)
+            head = replace(head, decision=whole.decision, also=whole.also)
         if own and name == "report.html":
             head = replace(head, badge=whole.badge, status=whole.status, reason=whole.reason)
         return replace(page, head=head)

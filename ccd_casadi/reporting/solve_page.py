@@ -22,6 +22,7 @@ from ccd_casadi.reporting.facts import (
     binding,
     conclusion,
     facts,
+    margins_table,
     requirements_table,
     run_name,
     theta_table,
@@ -147,7 +148,8 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
 
         assert isinstance(verified, VerifiedStructured)
         table = bandwidths_table(verified)
-        parts["loop"] = lambda: _loop(own, theta, view, table)
+        beside = margins_table(result, len(view.loops))
+        parts["loop"] = lambda: _loop(own, theta, view, table, *beside)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
@@ -175,7 +177,7 @@ def design_parts(
         ],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_chapter(own, theta, view.loop.controller),
-        "loop": lambda: _loop(own, theta, view),
+        "loop": lambda: _loop(own, theta, view, *margins_table(result, len(view.loops))),
     }
     if "proof" in result:
         parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
@@ -261,7 +263,7 @@ def _loop(
     if loop.bounded.required:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
-        c.Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
+        c.Chapter("Closed loop: S, KS and T against their bounds", (*more, gains(loop))),
         c.Chapter("What limits the bandwidth", limit_blocks(loop)),
         plots,
     ]

@@ -419,6 +419,33 @@ def test_a_constraint_that_no_point_meets_is_warned_of(
     assert not warned or "met at none of" in found[0]
 
 
+def test_check_names_a_lower_velocity_that_shortens_a_move_that_heat_limits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As stated in the case, the move takes this long; where the force limits there is none."""
+    path = case_file(tmp_path, GOOD)
+    of = path.read_text()
+
+    def found_with(velocity: float, power: float) -> dict:
+        path.write_text(
+            f"{of}[move]\ndistance = 0.1\nvelocity = {velocity!r}\njerk = 1e4\nsettle_band = 1e-6\n"
+            "dwell = 0.1\n[motor]\nforce_constant = 50.0\nresistance = 2.0\npeak_current = 20.0\n"
+            f"rms_power = {power}\n"
+        )
+        check([str(path), "--json"])
+        return json.loads(capsys.readouterr().out)  # type: ignore[no-any-return]
+
+    free = found_with(5.0, 20.0)
+    better = free["slower_is_faster"]
+    assert "heat" in free["move"]["limits"]
+    assert better["duration"] < free["move"]["duration"]
+    stated = found_with(better["velocity"], 20.0)["move"]
+    assert stated["duration"] == pytest.approx(better["duration"], rel=1e-9)
+    strong = found_with(5.0, 1e5)
+    assert "peak force" in strong["move"]["limits"]
+    assert strong["slower_is_faster"] is None
+
+
 def test_check_shows_what_a_move_needs_at_the_start(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

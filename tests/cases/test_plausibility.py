@@ -114,6 +114,20 @@ def test_inner_names_it_where_no_design_is_found(
     assert "inner.omega_low_hz = 300" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("output", ["rad", "m"])
+def test_a_soft_rotary_stage_is_asked_about_degrees(output: str) -> None:
+    """Where M_K suits far more than its first resonance."""
+    units = {"output": "rad", "input": "N m"} if output == "rad" else {}
+    case = case_study(units=units, weights={"M_K": 1e11})
+    try:
+        found = [words for words in suspicions(ccd.problem_of(case)) if "first resonance" in words]
+    finally:
+        use_units("m", "N")
+    assert len(found) == 1
+    assert ("per degree is 57.3 times" in found[0]) == (output == "rad")
+    assert ("1 N/um is 1e6 N/m" in found[0]) == (output == "m")
+
+
 @pytest.mark.parametrize("unit", ["N", "N m", "V", "A"])
 @pytest.mark.parametrize("M_K", [2e7, 20.0, 2e10])
 def test_no_mass_is_moved_by_what_is_not_a_force(unit: str, M_K: float) -> None:

@@ -29,10 +29,12 @@ from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.result_entries import move_entry
+from ccd_casadi.fixed_structure.uncertainty import modal_sum, unmoved_words
 from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.inner_problem.structured_search import least_from, prepare_search
 from ccd_casadi.lti.loop import Loop, Sampling, tustin, zoh
@@ -450,6 +452,33 @@ def slide(theta, stiffness):
     return {"mass": [[m]], "stiffness": [[stiffness]], "damping": [[0.0]], "input": [1],
             "output": [[1]], "hardware_cost": theta["m"]}
 """
+
+
+@pytest.mark.parametrize("size", ["moving_mass = 0.7", 'moving_mass = 0.7\nsize = "engine"'])
+def test_a_motor_leaves_the_expressions_of_a_plant_that_varies(tmp_path: Path, size: str) -> None:
+    """Of which a proof over what varies is made; another plant's is refused with a reason."""
+    own = """"mass": ca.diag(ca.vertcat(m, 1)), "stiffness": ca.DM([[9e4, -9e4], [-9e4, 9e4]]),
+            "damping_ratio": 0.02, "input": [1, 0], "output": [[1, 0]], "hardware_cost": m}"""
+    (tmp_path / "plant.py").write_text(
+        "import casadi as ca\n" + SLIDE.partition('"mass"')[0].replace(", stiffness", "") + own
+    )
+    text = HOT.format(k=0, power=2000.0).replace("stiffness = 0\n", "") + size
+    if "engine" in size:
+        text += '\n[theta.engine]\nlower = 0.5\nupper = 1.0\nstart = 0.8\nunit = "kg"\n'
+    (tmp_path / "case.toml").write_text(text)
+    problem = problem_of(load_case(tmp_path / "case.toml"))
+    box = uncertain_plant(problem, problem.start)
+    graph = box.graph(0)
+    assert graph is not None
+    for load in (0.0, 0.3, 2.0):
+        there = box.along(0, np.array([load]))
+        for name, found in zip("MDKBC", graph(load), strict=True):
+            if name != "D":  # which the ratio replaces
+                assert np.array(found) == pytest.approx(getattr(there, name), rel=1e-14), name
+    assert modal_sum(box, 0, 1.0) is not None
+    assert "expressions" in unmoved_words(replace(box, graph=lambda option: None))
+    matrix = replace(box.options[0], damping_ratio=None)
+    assert "damping ratio" in unmoved_words(replace(box, options=(matrix,)))
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 3e4])

@@ -8,8 +8,22 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.reporting.concerns import ConcernKind, ConcernOptions, resonance_condition, risks
-from ccd_casadi.reporting.decision import NEXT, Build, advice, decide
+from ccd_casadi.reporting.concerns import (
+    Concern,
+    ConcernKind,
+    ConcernOptions,
+    resonance_condition,
+    risks,
+)
+from ccd_casadi.reporting.decision import (
+    NEXT,
+    SENTENCES,
+    Build,
+    Decision,
+    DecisionOptions,
+    advice,
+    decide,
+)
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 
@@ -97,8 +111,43 @@ def test_no_decision_builds_what_breaks_a_bound_or_is_not_known(
     if found.builds:
         assert (ConcernKind.BUDGET in reasons) == ended
     for one in found.concerns:
-        assert one.words in found.words
-    assert found.words == advice(result)
+        assert one.words in advice(result)
+    assert advice(result).startswith(found.words)
+
+
+@given(
+    reasons=st.lists(st.integers(1, 60), max_size=6),
+    steps=st.lists(st.integers(1, 40), max_size=4),
+    remarks=st.lists(st.integers(1, 40), max_size=4),
+    condition=st.booleans(),
+)
+def test_an_engineer_reads_the_strongest_reasons_and_nothing_is_lost(
+    reasons: list[int], steps: list[int], remarks: list[int], condition: bool
+) -> None:
+    """A word has the number of its sentence, so that each is found once, and in its order."""
+
+    def texts(letter: str, lengths: list[int]) -> tuple[str, ...]:
+        return tuple(" ".join([f"{letter}{i}"] * n) for i, n in enumerate(lengths))
+
+    named = texts("r", reasons)
+    build = Build.IF_ACCEPTED if named else Build.YES
+    concerns = tuple(Concern(ConcernKind.LOOP, words) for words in named)
+    parts = texts("s", steps), texts("m", remarks)
+    found = Decision(build, concerns, parts[0], condition="c0" * condition, remarks=parts[1])
+    whole = " ".join([found.words, *found.also])
+    for words in (*named, *parts[0], *parts[1]):
+        assert whole.count(words.split()[0]) == len(words.split())
+        assert words in whole
+    assert ("c0" in found.words) == condition
+    options = DecisionOptions()
+    first = re.findall(r"r\d+(?=[ ;.])", found.words)
+    assert len(set(first)) <= options.most_reasons
+    assert not named or named[0] in found.words
+    beyond = " ".join([SENTENCES[build], *named[:1], "Next:", *parts[0][:1], "c0"])  # always in it
+    assert len(found.words.split()) <= options.most_words + len(beyond.split())
+    shown = [words in found.words for words in (*named, *parts[0])]
+    for part in (shown[: len(named)], shown[len(named) :]):
+        assert part == sorted(part, reverse=True)
 
 
 def test_a_larger_limit_is_no_remedy_where_the_move_does_not_settle_without_one() -> None:

@@ -26,9 +26,10 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.concerns import LINES
-from ccd_casadi.reporting.decision import advice
+from ccd_casadi.reporting.decision import advice, decide
 from ccd_casadi.reporting.facts import (
     facts,
+    margins_table,
     prediction_words,
     requirement_words,
     theta_table,
@@ -204,9 +205,30 @@ def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
     assert bool(alone) == bool(said)
     if said:
         both = advice(result_of(predicted="warned", deployable="unknown") | figures)
-        assert f"predicted warned; {said}" in both
+        assert f"accept: {said}" in both
+        assert "; predicted warned" in both
         assert "Deploy it first" in both
         assert said not in advice(result_of(survives="failed") | figures)
+
+
+def test_margins_of_the_model_are_beside_those_of_the_worst_plant() -> None:
+    """Of the loop as it was solved; of the model alone there is nothing beside."""
+    worst = {"phase_margin_deg": 40.0, "gain_margin": 2.0, "delay_margin_us": 300.0,
+             "modulus_margin": 0.5}  # fmt: skip
+    result = result_of() | worst
+    own = {"phase_margin_deg": 45.0, "gain_margin": [0.25, 3.0], "modulus_margin": 0.6}
+    result["verdict"]["survives"] |= {"phase_margin_deg": 1.0, "at_solve": own}  # by `robustness`
+    result["verdict"]["deployable"]["delay_margin"] = 400e-6
+    (table,) = margins_table(result, 5)
+    found = {row[0].partition(",")[0]: row[1:] for row in table.rows}
+    assert found["phase"] == ("45°", "40°")
+    assert found["gain"] == ("3", "2")
+    assert found["delay"] == ("400 µs", "300 µs")
+    assert found["modulus"] == ("0.6", "0.5")
+    own["gain_margin"] = [0.5, None]  # less gain may be what makes it unstable
+    assert ("gain, × or ÷", "2", "2") in margins_table(result, 5)[0].rows
+    assert margins_table(result, 1) == ()
+    assert margins_table(result_of(), 5) == ()
 
 
 def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
@@ -227,7 +249,8 @@ def test_an_open_proof_hides_no_limit_that_the_loop_exceeds() -> None:
         assert words in said
         assert words not in bare
     assert said.startswith("Build this only if you accept: the bounds are not proven")
-    assert run_head("", result | poor, "", "").decision == said
+    head = run_head("", result | poor, "", "")
+    assert (head.decision, head.also) == (decide(result | poor).words, decide(result | poor).also)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,9 @@ from ccd_casadi.cases.checks import CaseError
 from ccd_casadi.cases.diagnosis import diagnose, suspicions
 from ccd_casadi.codesign.final_judgement import other_damping, plants_of_set
 from ccd_casadi.codesign.joint_model import JointModel, JointPoint
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, ProofOutcome, _families, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
@@ -36,6 +38,7 @@ from ccd_casadi.lti.wiring import Filters, ForcedPlant, OwnPorts, Wiring
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust.perturbed import sampled_compliance
 from ccd_casadi.solve import main as solve
+from ccd_casadi.solve import with_causes
 from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.text import HZ
 
@@ -479,6 +482,10 @@ def test_a_compliance_below_that_of_the_held_sensor_is_a_warning(
     assert bool(words) == any("sensor held still" in cause for cause in suspicions(problem))
     loose = with_structured(problem, structure=Structure(integrator=False))
     assert not [item for item in diagnose(loose)[1] if "compliance_max" in item.words]
+    ended = {"status": "infeasible", "reason": "none", "time_budget": {"ended": True}}
+    failed = Solution(ended, FormulationResult(), None)
+    reason = str(with_causes(failed, load_case(case), problem).result["reason"])
+    assert ("a larger --budget" in reason) == (count < 6)  # which no time changes
 
 
 @pytest.mark.parametrize("more", ["", "[actuator]\nlag_hz = 2000.0"])

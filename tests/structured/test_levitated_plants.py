@@ -13,7 +13,9 @@ from scipy.linalg import solve
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.codesign.outer_problem import FormulationResult
 from ccd_casadi.codesign.result_entries import IsoZones, iso_entry
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart, axis_of
@@ -29,6 +31,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.solve import with_causes
 
 HZ = 2.0 * np.pi
 RUN = Sampling(1e4, 100.0)
@@ -167,8 +170,14 @@ def test_a_pole_too_fast_for_the_delay_is_reported_before_a_search(tmp_path) -> 
     path = tmp_path / "case.toml"
     for start, reported in (("50.0", False), ("1000.0", True)):
         path.write_text(case.replace("START", start))
-        words = " ".join(found.words for found in diagnose(problem_of(load_case(path)))[1])
+        problem = problem_of(load_case(path))
+        words = " ".join(found.words for found in diagnose(problem)[1])
         assert "the stiffness drives a motion away at the start" in words
+        pole = f"as no spring makes): an unstable pole at +{float(start):g} Hz"
+        for status, named in (("infeasible", True), ("not_verified", False), ("verified", False)):
+            failed = Solution({"status": status, "reason": "none"}, FormulationResult(), None)
+            why = with_causes(failed, load_case(path), problem).result["reason"]
+            assert (pole in why) is named
         assert ("no controller has a peak of S below 2.51" in words) is reported
 
 

@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum, unmoved_words
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.lti.loop import tustin, zoh
 from ccd_casadi.plants.modal import modal_plant
@@ -172,7 +172,9 @@ def test_what_is_not_enclosed_is_named() -> None:
         replace(BOX, graph=lambda option: kinked),
         replace(BOX, options=(matrix,)),
     ):
-        assert prove(box, STRUCTURE, KAPPA, 1.0, BARE, LATE).outcome is ProofOutcome.VARIES
+        proof = prove(box, STRUCTURE, KAPPA, 1.0, BARE, LATE)
+        assert proof.outcome is ProofOutcome.VARIES
+        assert proof.words.endswith(f"so its range was searched: {unmoved_words(box)}")
     assert prove(replace(BOX, options=(two,)), STRUCTURE, KAPPA, 1.0, BARE, LATE).outcome in (
         ProofOutcome.VARIES, ProofOutcome.NOT_SQUARE,
     )  # fmt: skip
