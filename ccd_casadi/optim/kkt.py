@@ -6,7 +6,7 @@ gradients of the active constraints and bounds as rows:
     ∇J + Aᵀμ = 0,   μ >= 0,   μᵢ gᵢ = 0,   ZᵀHZ >= 0 on the null space Z of rows with μᵢ > 0,
 
 with H the Hessian of L = J + μᵀg (Nocedal and Wright, Numerical Optimization, theorems 12.1 and
-12.5). Of rows with μᵢ = 0 theirs holds on a half-space, so that this asks no less.
+12.5). Of rows with μᵢ = 0 theirs holds on a half-space, so that this is no weaker.
 
 g is in shares of a size of each constraint, so that one tolerance serves all.
 """
@@ -173,7 +173,7 @@ class ActiveSet:
         self, mu: Array, residual: float, second: float | None, kink: Kink | None = None
     ) -> KktCertificate:
         """The certificate, with multipliers per unit of g instead of per share."""
-        per_unit = zip(self.labels, mu / self.scales, strict=True)
+        per_unit = zip(self.labels, mu / self.sizes, strict=True)
         return KktCertificate(
             stationarity=residual,
             primal=self.violation,
