@@ -243,19 +243,17 @@ def test_what_repeated_measurements_leave_open_is_in_the_bound_on_S(tmp_path) ->
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_a_line_on_which_a_sensor_is_dead_is_no_error_of_the_bound(channels: int) -> None:
+def test_a_line_that_the_controller_blocks_is_no_error_of_the_bound(channels: int) -> None:
     """L has no inverse there: by L alone the bound is the larger, and the same elsewhere."""
     hz = np.geomspace(1.0, 100.0, 40)
     s = 1j * hz[:, None, None]
     G = np.eye(channels) / s**2 + 0.1 * np.ones((channels, channels)) / (s + 30.0)
+    lines = MeasuredResponse(hz, G if channels > 1 else G[:, 0, 0])
     K = np.broadcast_to(20.0 * np.eye(channels) + 0j, G.shape)
-    dead = G.copy()
-    dead[20, 0] = 0.0
-    whole, with_dead = (
-        bound_between_lines(MeasuredResponse(hz, g if channels > 1 else g[:, 0, 0]), g @ K, K)
-        for g in (G, dead)
-    )
+    blocking = K.copy()
+    blocking[20, 0] = 0.0
+    whole, blocked = (bound_between_lines(lines, G @ each, each) for each in (K, blocking))
     far = np.abs(np.arange(39) - 19.5) > 3.0  # second differences reach two lines further
-    np.testing.assert_allclose(with_dead[far], whole[far], rtol=1e-9)
-    S = np.linalg.norm(np.linalg.inv(np.eye(channels) + dead @ K), 2, axis=(1, 2))
-    assert (with_dead >= (1.0 - 1e-9) * np.maximum(S[1:], S[:-1])).all()
+    np.testing.assert_allclose(blocked[far], whole[far], rtol=1e-9)
+    S = np.linalg.norm(np.linalg.inv(np.eye(channels) + G @ blocking), 2, axis=(1, 2))
+    assert (blocked >= (1.0 - 1e-9) * np.maximum(S[1:], S[:-1])).all()

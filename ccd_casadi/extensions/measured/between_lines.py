@@ -192,7 +192,7 @@ def bound_between_lines(measured: MeasuredResponse, L: np.ndarray, K: np.ndarray
     hz, unsure = measured.hz, np.zeros(len(L))
     if measured.spread is not None:
         unsure = sigma_max(measured.spread.reshape(measured.matrix.shape) @ np.abs(K))
-    # Where L is singular, as where a sensor or K is 0, its inverse is out of all proportion.
+    # Where L is singular, as where K blocks a channel, its inverse is out of all proportion.
     singular = np.linalg.det(L)[:, None, None] == 0.0
     inverse = np.linalg.inv(np.where(singular, 1e-100 * np.eye(L.shape[1]), L))
     size = sigma_max(inverse)
