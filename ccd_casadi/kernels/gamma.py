@@ -2,7 +2,8 @@
 
 docs/theory.md derives both; t = γ² - d1². In 1/t the Hamiltonian is affine and f nearly straight,
 so that Newton's method needs fewer steps in 1/t than in t. Near the root the third-order expansion
-of the stable subspace takes its place: a step of order four from one Schur form, whose own terms show when it is good enough.
+of the stable subspace takes its place: a step of order four from one Schur form, whose own terms
+show when it is good enough.
 """
 
 from typing import NamedTuple
@@ -153,8 +154,8 @@ def rounding_error(frame, t, d1):
 
     With f = c/s as in `riccati_level`, a change δH moves s² f by tr(Λ R),
     R = [-U2; U1]ᵀ δH [U1; U2] and T11 Λ + Λ T11ᵀ + qqᵀ = 0. With δH of |δH| = BACKWARD |H|
-    spread evenly over its 2N x 2N entries, R has entries of size |δH|/2N, and their sum with Λ the size |Λ| |δH|/2N. Since
-    s² f' = qᵀZq/t², t moves by that over qᵀZq/t², and δγ/γ = δt/(2 γ²).
+    spread evenly over its 2N x 2N entries, R has entries of size |δH|/2N, and their sum with Λ the
+    size |Λ| |δH|/2N. Since s² f' = qᵀZq/t², t moves by that over qᵀZq/t², and δγ/γ = δt/(2 γ²).
     """
     H, T11, _, _, _, Z, q, _, _ = frame
     N = q.size

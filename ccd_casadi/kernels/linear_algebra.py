@@ -245,7 +245,8 @@ def jacobi_svd(M, rows, columns, V, sigma, vectors):
     """M ← M V with orthogonal columns of the lengths σ, the longest first; V is unitary.
 
     M is the upper left of an array. One-sided rotations (Hestenes; Golub and Van Loan, Matrix
-    Computations, 8.6): small σ come out as exactly as large ones. Of columns x and y with a = ‖x‖², b = ‖y‖², h = xᴴy,
+    Computations, 8.6): small σ come out as exactly as large ones. Of columns x and y with a = ‖x‖²,
+    b = ‖y‖², h = xᴴy,
 
         x' = c x - s̄ y,   y' = s x + c y,   c = 1/√(1 + t²),   s = t c h/|h|,
 
