@@ -217,7 +217,7 @@ def structured_answer(
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
     if least is not None:
-        if problem.w2 > 0.0:  # else J does not count it, not even an infinite one
+        if problem.w2 > 0.0:  # a negative one, which `solve` refuses, is of the bandwidth
             value = least.value
         entry = problem.figure.entry
         head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
