@@ -58,7 +58,7 @@ def _reinsert_at(problem: Problem, end: Point, options: ReinsertionOptions) -> l
     names, kinds, kappa = problem.structure.names, problem.structure.kinds, end.kappa
     if ParameterKind.FREQUENCY not in kinds:
         return []
-    # Of an end outside its bounds those that it misses most count as active: all are moved to 0.
+    # Of an end outside its bounds those that it misses most are active: the largest is moved to 0.
     peaks, over = end.assessment.peaks, end.assessment.violation
     assert peaks is not None
     shifted = replace(end.assessment, peaks=replace(peaks, value=peaks.value - over))
