@@ -72,11 +72,16 @@ Options = tuple[tuple[str, object], ...]  # of a plant: (name, value), sorted by
 class ControllerProblem:
     """The statement of the controller in a problem; the base of all kinds.
 
-    What it does not override is that of a continuous controller of largest bandwidth, on the plant
-    of the case alone.
+    What a kind does not override is that of a continuous controller of largest bandwidth, on the
+    plant of the case alone.
+
+    Attributes
+    ----------
+    kernels : tuple of str
+        Groups of compiled kernels that its searches need.
     """
 
-    kernels: ClassVar[tuple[str, ...]] = ()  # groups of compiled kernels that its searches need
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -113,7 +118,13 @@ class ControllerProblem:
 
 @dataclass(frozen=True)
 class MixedSensitivityProblem(ControllerProblem):
-    """An H∞ controller by the weights W_S, W_KS and W_T, which the problem itself states."""
+    """An H∞ controller by the weights W_S, W_KS and W_T, which the problem itself states.
+
+    Attributes
+    ----------
+    kernels : tuple of str
+        Groups of compiled kernels that its searches need.
+    """
 
     kernels: ClassVar[tuple[str, ...]] = ("synthesis",)
 
