@@ -31,6 +31,8 @@ class FeedforwardOptions:
         Of the circle, over the nearest singularity of the inverse.
     rounding : float
         Of the inverse on the circle: a coefficient that is less there is 0.
+    zero : float
+        Over the fastest pole: a zero of the plant that is nearer to s = 0 counts as there.
     slow : float
         Over the slowest pole: where inputs are shared among more of them than outputs.
     """
@@ -39,6 +41,7 @@ class FeedforwardOptions:
     points: int = 64
     radius: float = 0.25
     rounding: float = 1e-11
+    zero: float = 1e-9
     slow: float = 1e-3
 
 
@@ -46,12 +49,14 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     """Gains of the feedforward of a setpoint, u = F_0 r + Σ_i F_i mean r^(i), as `forward_force`.
 
     A force that is held for a period has to be the mean of what is needed over it, which a jerk or
-    snap that jumps inside makes of the means of the derivatives. With x = sT/2 hold and mean are
-    sinh(x)/x each, so that y = r at the instants up to s⁴ by the Taylor coefficients of
+    snap that jumps inside makes of the means of the derivatives. With x = sT/2 the hold is
+    (1 - e^(-sT))/(sT) = e^(-sT/2) sinh(x)/x, and the mean of s^i r over a period about the instant
+    s^i sinh(x)/x r. So y = r at the instants up to s⁴, behind a delay τ, where
 
-        F_0 + Σ_i F_i s^i sinh(x)/x = e^(s(τ + T/2)) x/sinh(x) G(s)⁻¹
+        F_0 + Σ_i F_i s^i sinh(x)/x = e^(s(τ + T/2)) x/sinh(x) G(s)⁻¹:
 
-    by Cauchy's integral on a circle within which it is analytic: its aliasing error is
+    F_0 is the right side at s = 0, and F_i the Taylor coefficients of x/sinh(x) (right side - F_0).
+    They are Cauchy's integrals on a circle within which these are analytic: its aliasing error is
     radius^(points - order). Free bodies have F_0 = 0, without dampers F_1 = 0.
 
     Parameters
@@ -78,8 +83,9 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
 
 
 def _allocation(plant: StateSpace, options: FeedforwardOptions = FeedforwardOptions()) -> Array:
-    """The inputs (m, p) that move each output alone when slow, with the least forces: constants, so
-    that the inverse of what they leave is analytic."""
+    """The inputs (m, p) that move each output alone when slow, with the least forces: G(0)⁺, or of
+    free bodies its limit but for a factor. Constants, so that the inverse of what they leave is
+    analytic."""
     (_, m), p = plant.B.shape, len(plant.C)
     if p > m:
         raise UserError(f"the plant has {p} outputs and {m} inputs: no feedforward moves one alone")
@@ -98,42 +104,45 @@ def feedforward_slopes(
     delay: float,
     options: FeedforwardOptions = FeedforwardOptions(),
 ) -> tuple[Array, Array]:
-    """F, and dF (k, order + 1, m, p) of k changes (dA, dB, dC) of a square plant.
+    """F, and dF (k, order + 1, m, p) of k changes (dA, dB, dC) of a square plant; its D stays.
 
-    dG⁻¹ = -G⁻¹ dG G⁻¹
+    They are linear in G⁻¹, and with X = (s - A)⁻¹B
+
+        dG⁻¹ = -G⁻¹ dG G⁻¹,   dG = dC X + C (s - A)⁻¹ (dA X + dB).
     """
     count, terms = options.points, options.order + 1
     poles = np.abs(plant.poles)
     fastest = float(poles.max())  # 0 of masses alone, whose inverse is analytic everywhere
+    # The inverse is singular at zeros of the plant; without any the fastest pole is a scale.
     nearest = min([*np.abs(plant.zeros(fastest or 1.0)), fastest or np.inf])
-    if not nearest > 1e-9 * fastest:
+    if not nearest > options.zero * fastest:
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
     late = delay + 0.5 * period
     stays = 1.0 / late if late > 0.0 else max(fastest, 1.0)  # where exp stays of size one
     radius = min(options.radius * nearest, stays)
     s = radius * np.exp(2j * np.pi * np.arange(count) / count)
-    X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
-    G = plant.C @ X + plant.D
-    inverse = np.linalg.inv(G)
+    s_A = s[:, None, None] * np.eye(len(poles)) - plant.A
+    X = np.linalg.solve(s_A, plant.B + 0j)
+    inverse = np.linalg.inv(plant.C @ X + plant.D)
     x = 0.5 * period * s
-    hold = (x / np.sinh(x) if period else np.ones_like(s))[:, None, None]
-    ahead = hold * np.exp(s * late)[:, None, None]
+    unheld = (x / np.sinh(x) if period else np.ones_like(s))[:, None, None]
+    ahead = unheld * np.exp(s * late)[:, None, None]
 
-    def series(values: np.ndarray) -> Array:
-        first = (ahead * values).mean(axis=0)  # of r itself, which is not a mean
-        found = np.fft.fft(hold * (ahead * values - first), axis=0).real[:terms] / count
-        found[0] += first.real
+    def coefficients(values: np.ndarray) -> Array:
+        """Taylor coefficients by the mean over the circle, from values (count, m, p) of G⁻¹."""
+        at_rest = (ahead * values).mean(axis=0)  # F_0, of r itself, which is not a mean
+        found = np.fft.fft(unheld * (ahead * values - at_rest), axis=0).real[:terms] / count
+        found[0] += at_rest.real
         size = np.abs(values).max(axis=0)
         size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
         found[np.abs(found) <= options.rounding * size] = 0.0
         return np.asarray(found / radius ** np.arange(terms)[:, None, None])
 
-    F, dF = series(inverse), np.zeros((len(changes), terms, *inverse.shape[1:]))
+    dF = np.zeros((len(changes), terms, *inverse.shape[1:]))
     for i, (dA, dB, dC) in enumerate(changes):
-        whole = s[:, None, None] * np.eye(len(poles)) - plant.A
-        dG = dC @ X + plant.C @ np.linalg.solve(whole, dA @ X + dB)
-        dF[i] = series(-inverse @ dG @ inverse)
-    return F, dF
+        dG = dC @ X + plant.C @ np.linalg.solve(s_A, dA @ X + dB)
+        dF[i] = coefficients(-inverse @ dG @ inverse)
+    return coefficients(inverse), dF
 
 
 def forward_of(
@@ -152,9 +161,9 @@ def forward_of(
 
     Returns
     -------
-    array (5, m)
-        F of `feedforward`; of several sensors (5, p) of the output that counts, in the column of
-        each sensor its share in that.
+    array (5, m, p)
+        F of `feedforward`; of several sensors that of the output that counts, in the column of each
+        sensor times its share in that.
     """
     if not places:
         return feedforward(plant, period, delay)
@@ -228,7 +237,7 @@ def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
     time : array (N,)
         s.
     period : float
-        T in s.
+        T in s, above 0.
 
     Returns
     -------

@@ -89,7 +89,7 @@ class InnerOptions:
     begin_at: Path | None = None
 
 
-def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
+def _common_entries(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
     """θ by name, what the hardware costs, and what a reader must know of the plant there."""
     return {
         "notes": list(notes_of(problem, theta)),
@@ -125,15 +125,10 @@ def mixed_answer(
     if options.begin_at is not None:
         raise UserError('--begin-at is for structure = "sections"; leave it out')
     point = options.point
-    head = head_of(problem, theta)
+    head = _common_entries(problem, theta)
     rows: tuple[DesignFigures, ...] = ()
     if point is not None:
-        at = point
-
-        def peak(choice: CoDesignProblem) -> float:
-            return float(np.nan_to_num(true_design(choice, theta, *at).values[1], nan=np.inf))
-
-        problem, syntheses = min(design_choices(problem), key=peak), 1
+        problem, syntheses = _best_design_plant(problem, theta, point), 1
     else:
         problem, found = best_choice(problem, theta)
         syntheses, rows = found.syntheses, found.rows
@@ -163,16 +158,29 @@ def mixed_answer(
         "judge": judged.entry,
         "second_engine": second.entry,
     }
-    held = judged.passed or not feasible  # at given frequencies S_max may not be met
+    # At given frequencies a bound may be missed, but a loop without figures is unstable or unknown.
+    held = judged.passed or (not feasible and bool(judged.figures))
     good = made.figures.certified and held and second.agrees is not False
     status = "verified" if good else "not_verified"
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
 
+def _best_design_plant(
+    problem: CoDesignProblem, theta: Sequence[float], point: tuple[float, float]
+) -> CoDesignProblem:
+    """The problem with that design plant whose synthesis at `point` has the lowest peak of S."""
+
+    def peak(choice: CoDesignProblem) -> float:
+        found = true_design(choice, theta, *point).figures.sensitivity_peak
+        return float(np.nan_to_num(found, nan=np.inf))
+
+    return min(design_choices(problem), key=peak)
+
+
 def structured_answer(
     problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
-    """The largest bandwidth (or least of another figure) at θ, judged over its box.
+    """The largest bandwidth (or least of another figure) at θ, judged over its box of plants.
 
     Parameters
     ----------
@@ -197,19 +205,20 @@ def structured_answer(
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
     begin_at, log, workers = options.begin_at, options.log, options.workers
-    head = head_of(problem, theta)
-    required = replace(with_range(with_state(problem, seed=options.seed)), start=theta)
+    head = _common_entries(problem, theta)
+    searched = replace(with_range(with_state(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
-        kappa = sections_kappa(begin_at, structure_of(required))
-        required = with_state(required, warm_starts=(kappa,))
-    required, made, worst = prepare_search(required, log, workers, begin_at is not None)
+        kappa = sections_kappa(begin_at, structure_of(searched))
+        searched = with_state(searched, warm_starts=(kappa,))
+    searched, made, worst = prepare_search(searched, log, workers, begin_at is not None)
     fastest = made.bandwidth
-    required, made, least = least_from(required, theta, made, log, workers)
+    searched, made, least = least_from(searched, theta, made, log, workers)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
     if least is not None:
-        value = least.value if problem.w2 > 0.0 else made.bandwidth
+        if problem.w2 > 0.0:  # a negative one, which `solve` refuses, is of the bandwidth
+            value = least.value
         entry = problem.figure.entry
         head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
             f"{entry}_of_set": least.value,
@@ -217,15 +226,15 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
-    on_box = DesignOnBox(required, theta, made)
-    if worst is None or least is not None:
+    on_box = DesignOnBox(searched, theta, made)
+    if worst is None or least is not None:  # `worst` is of the fastest design
         worst = on_box.worst(workers=workers)[0]
     wide, checked, proof = on_box.judge(worst, workers)
     assert made.controller is not None
-    second = second_on_set(required, theta, made)
+    second = second_on_set(searched, theta, made)
     passed = wide.passed and not proof.refuted and second.agrees is not False
     figures = head | {
-        **design_dict(required, theta, made),
+        **design_dict(searched, theta, made),
         "active": active_of(made),
         "feasible": True,
         "objective": objective(problem, theta, value),
@@ -234,8 +243,8 @@ def structured_answer(
         "judge": judgement_of(wide, checked).entry,
         "second_engine": second.entry,
         "syntheses": 1,
-        **budget_entry(required, theta, made.controller),
-        **move_entry(required, theta, made.controller),
+        **budget_entry(searched, theta, made.controller),
+        **move_entry(searched, theta, made.controller),
     }
     status = "verified" if passed else "not_verified"
-    return InnerAnswer(status, figures, sections_controller(made, required.sampling))
+    return InnerAnswer(status, figures, sections_controller(made, searched.sampling))

@@ -44,7 +44,7 @@ def newton_step(here: TrueDesign) -> Array | None:
     held = np.array([mu[name] > 0.0 for name in at.labels], bool)
     A = at.rows[held]
     inside = np.array([here.options.inside * (name in problem.inner.bounds) for name in at.labels])
-    aim = np.where(np.arange(held.size) < at.constraints, -(at.slack + inside), 0.0)[held]
+    aim = np.where(np.arange(held.size) < at.constraints, -(at.values + inside), 0.0)[held]
     Z = null_space(A)
     if Z.shape[1] == 0:  # a vertex
         return None

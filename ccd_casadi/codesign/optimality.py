@@ -101,13 +101,13 @@ def theta_kkt(
     if residual > options.smooth and envelope is not None:
         direct = own.cost_gradient + problem.w2 * envelope.direct * bounds.width
         to_theta = problem.w2 * envelope.to_theta * bounds.width
-        joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.size, options)
+        joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.scale, options)
         if joint < 0.5 * residual:
             multipliers = dict.fromkeys(envelope.names, 0.0)
             for word, value in zip(envelope.names, mu, strict=False):
                 multipliers[word] += float(value)
             kink, residual, nu = Kink(residual, (), multipliers), joint, pair
-    Z = _steepest_first(at.free(nu), at.gradient)
+    Z = _steepest_first(at.null_space(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
     if second is not None or truth is None:
         return at.certificate(nu, residual, second, kink)
@@ -123,11 +123,11 @@ def theta_kkt(
 
     if kink is not None:
         step = KktOptions.step if beside else options.difference
-        slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size, step)
+        slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.scale, step)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif beside is None:  # λ's own curvature is left out
         columns = hessian_products(gradients, bounds.shares(sample.theta), Z, options.difference)
-        second = reduced_curvature(Z, columns, at.size)
+        second = reduced_curvature(Z, columns, at.scale)
     return at.certificate(nu, residual, second, kink)
 
 
@@ -351,12 +351,12 @@ def active_at(here: TrueDesign, others: tuple[PeakConstraint, ...] = ()) -> Acti
 
 def _certificate(here: TrueDesign, at: ActiveSet, second: bool) -> KktCertificate:
     mu = at.multipliers()
-    Z = at.free(mu)
+    Z = at.null_space(mu)
     found = at.certificate(mu, at.residual(mu), np.inf if Z.shape[1] == 0 else None)
     if not (second and Z.shape[1]):
         return found
     columns = lagrangian_hessian(here, Z, found.multipliers)
-    return replace(found, second_order=reduced_curvature(Z, columns, at.size))
+    return replace(found, second_order=reduced_curvature(Z, columns, at.scale))
 
 
 def first_order(

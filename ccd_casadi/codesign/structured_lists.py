@@ -33,6 +33,7 @@ from ccd_casadi.inner_problem.objective import (
     ConstraintOptions,
     constraint_shares,
     objective_of,
+    objective_terms,
     violations,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -63,11 +64,14 @@ class ListedOptions:
     Attributes
     ----------
     settled : float
-        Of the terms of J: between the values of a list a step that promises less is not taken, as
-        no design is there. J itself may be near 0.
+        Share of |w1 f| + |w2 v|, of which J may be a small difference: between the values of a list
+        a step that promises less is not taken, as no design is there.
+    inside : float
+        Of λ, in its unit: by how much a search begins within λ(θ) <= 0.
     """
 
     settled: float = 1e-3
+    inside: float = 1e-7
 
 
 @dataclass
@@ -75,7 +79,7 @@ class ListedStructured:
     """`between`, `search` and `judge` as `best_of_lists` requires them.
 
     `solve` continues from a θ to a whole co-design. `scenarios`: all plants that were found worse
-    than those of the set, at any of the θ.
+    than those of the set, at any of the θ; each search adds its own, and the next begins with them.
     """
 
     formulation: Formulation
@@ -85,7 +89,7 @@ class ListedStructured:
     options: ListedOptions = ListedOptions()
 
     def between(self, sampler: Sampler, near: Solution | None) -> Solution:
-        """Search as `search` does, to the accuracy that a bound needs."""
+        """Search as `search` does, to the accuracy that the bound of a part needs."""
         return self.search(sampler, near, self.options.settled)
 
     def search(
@@ -95,32 +99,40 @@ class ListedStructured:
         problem = sampler.problem
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
-            return _nothing(forbidden)
-        found = self._anew(sampler, settled) if near is None else self._near(sampler, near, settled)
+            return _infeasible(forbidden)
+        if near is None:
+            found = self._search_anew(sampler, settled)
+        else:
+            found = self._search_near(sampler, near, settled)
         if found.problem is not None:
             self.scenarios = state_of(found.problem).scenarios
         return found
 
-    def _anew(self, sampler: Sampler, settled: float | None) -> Solution:
+    def _search_anew(self, sampler: Sampler, settled: float | None) -> Solution:
+        """From the problem's start by many controllers; from a Sobol set while nothing is found."""
         outer = StructuredOuter(sampler).prepare(self.seed)
         found = _descend(outer.sampler, np.array(sampler.problem.start), settled)
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
-            allowed = _nearest_allowed(sampler.problem, theta)
-            if not np.isfinite(found.result.get("objective", np.inf)) and allowed is not None:
+            if "objective" in found.result:
+                break
+            allowed = nearest_allowed(sampler.problem, theta, self.options)
+            if allowed is not None:
                 found = _descend(outer.sampler, allowed, settled)
         return found
 
-    def _near(self, sampler: Sampler, near: Solution, settled: float | None) -> Solution:
-        problem, known = sampler.problem, _start(near)
+    def _search_near(self, sampler: Sampler, near: Solution, settled: float | None) -> Solution:
+        """From the θ of a solution, as near as this part has one, and from its controller."""
+        problem, known = sampler.problem, _problem_from(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
-        theta = _nearest_allowed(problem, np.array([values[name] for name in problem.names]))
+        begin = np.array([values[name] for name in problem.names])
+        theta = nearest_allowed(problem, begin, self.options)
         if theta is None:
-            return _nothing("no theta within the constraints was found")
+            return _infeasible("no theta within the constraints was found")
         return _descend(sampler.of(carry_over(known, problem, self.scenarios)), theta, settled)
 
     def judge(self, sampler: Sampler, solution: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
-        near = _start(solution)
+        near = _problem_from(solution)
         started = carry_over(near, replace(sampler.problem, start=near.start), self.scenarios)
         whole = self.solve(sampler.of(started), np.array(near.start))
         if whole.verified is not None:
@@ -132,25 +144,26 @@ def _descend(sampler: Sampler, theta: Array, settled: float | None = None) -> So
     """Descend from θ to the least J near by; by steps along the truth where the joint search breaks
     λ.
 
-    `settled`: of the terms of J, as in `ListedOptions`; None: as near as any joint search."""
+    `settled`: as in `ListedOptions`; None: as near as any joint search.
+    """
     best = first = sampler.values(theta, "nearby designs")[0]
-    required, options = sampler, JointSearchOptions()
+    own, options = sampler, JointSearchOptions()
     J = objective_of(sampler.problem, first)
-    if settled is not None and J:
-        hardware = sampler.problem.w1 * hardware_cost(plant_of(sampler.problem), first.theta)
-        share = settled * (abs(hardware) + abs(J - hardware)) / abs(J)
+    if settled is not None and J and np.isfinite(J):  # of |J|, as the joint search counts it
+        terms = objective_terms(sampler.problem, first.theta, first.value)
+        share = settled * sum(map(abs, terms)) / abs(J)
         options = replace(options, model=replace(options.model, settled=share))
     if sampler.problem.figure is BANDWIDTH:
         log = printer("nearby designs", sampler.quiet)
-        required, best, _ = joint_search(sampler, theta, log, ends=(), options=options)
-    if best.theta == first.theta or violations(required.problem, best.theta):  # it lost λ
+        own, best, _ = joint_search(sampler, theta, log, ends=(), options=options)
+    if best.theta == first.theta or violations(own.problem, best.theta):
         descent = ThetaDescentOptions()
         best = pieces_from(sampler, first, descent.settled, descent.far_radius)
-        required = sampler
-    problem = required.problem
+        own = sampler
+    problem = own.problem
     J = objective_of(problem, best)
     if not np.isfinite(J):
-        return _nothing(best.shortfall)
+        return _infeasible(best.shortfall)
     result = {
         "status": "searched",
         "objective": J,
@@ -160,7 +173,7 @@ def _descend(sampler: Sampler, theta: Array, settled: float | None = None) -> So
         f"{problem.figure.entry}_of_set": best.value,
     }
     outcome = FormulationResult(np.array(best.theta), agreed=True)
-    return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
+    return Solution(result, outcome, None, problem=_begin_at(problem, best.theta, best.kappa))
 
 
 def carry_over(
@@ -178,32 +191,36 @@ def carry_over(
     return with_state(problem, **moved)
 
 
-def _start(solution: Solution) -> CoDesignProblem:
+def _problem_from(solution: Solution) -> CoDesignProblem:
     """The problem of a solution with its θ as the start and its controller as the warm start."""
     if solution.verified is None:
         assert solution.problem is not None
         return solution.problem
     verified = cast(VerifiedStructured, solution.verified)
-    return _at(verified.problem, verified.theta, tuple(map(float, verified.design.kappa)))
+    return _begin_at(verified.problem, verified.theta, tuple(map(float, verified.design.kappa)))
 
 
-def _at(
+def _begin_at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
+    """A problem whose searches begin at θ with the controller κ, and no other."""
     alone = with_state(problem, warm_starts=(kappa,), error_warm_starts=())
     return replace(with_warm_start(alone, kappa, 1), start=theta)
 
 
-def _nothing(words: str) -> Solution:
+def _infeasible(words: str) -> Solution:
     result = {"status": "infeasible", "reason": words, "syntheses": 0}
     return Solution(result, FormulationResult(message=words), None)
 
 
-def _nearest_allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-7) -> Array | None:
-    """The nearest θ within the box and λ(θ) <= -`inside`; None where none is found.
+def nearest_allowed(
+    problem: CoDesignProblem, theta: Array, options: ListedOptions = ListedOptions()
+) -> Array | None:
+    """The nearest θ, in shares of the box, within it and λ(θ) <= -`inside`; None where none is
+    found.
 
-    A constraint on listed values alone is a number here, which may be 0: as many places are chosen
-    as may be.
+    A constraint on listed values alone does not depend on θ here. It is a number, which may be 0,
+    as where this many places are to be chosen.
     """
     bounds, plant, x = box(problem), plant_of(problem), ca.MX.sym("theta", len(theta))
     lam, theta = plant.hardware(x)[1], np.clip(theta, *bounds)
@@ -216,7 +233,7 @@ def _nearest_allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-
     if not rows:
         return theta
     f = ca.sumsqr((x - theta) / bounds.width)
-    program = NonlinearProgram(x, f, lam[rows] + inside, bounds, plant.exact_hessian)
+    program = NonlinearProgram(x, f, lam[rows] + options.inside, bounds, plant.exact_hessian)
     try:
         return np.clip(solve_program(program, theta).best.x, *bounds)
     except OuterFailure:

@@ -1,8 +1,8 @@
 """The design that a run ends with, and what was found out about it: alike for every controller.
 
-Each kind of controller says what only it knows (`figures`, `evidence`, some lines of the verdict);
-what the outer problem is judged by is here, and results, verdicts and pages use nothing else.
-`Solution` is what a whole run leaves.
+`Verified` is one interface: results, verdicts and pages use nothing else. It holds what the outer
+problem is judged by; each kind of controller adds what only it knows (`figures`, `evidence`, some
+lines of the verdict), or overrides what most have not. `Solution` is what a whole run leaves.
 """
 
 from abc import ABC, abstractmethod
@@ -50,22 +50,23 @@ class Verified(ABC):
         Has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind reads
         these elsewhere.
     value, objective, hardware_cost : float
-        What J counts of the controller (SI), J and f.
+        What J = w1 f + w2 v counts of the controller (v, SI), J and f.
     kkt : KktCertificate
         Of optimality.
     inner_gap : float
-        By how much (relative) a search of the whole inner problem at θ is better, NaN where it
-        found nothing.
+        By how much (relative) a search of the whole inner problem at θ finds a better v; NaN where
+        it found nothing.
     feasible : bool
         Certified, within its bounds, and λ(θ) <= 0.
     survival, damping : Survival, OtherDamping
-        Off the model; None where the loop is not stable.
+        How far resonances may be off the model, and what other damping does; None where the loop is
+        not stable.
     second : EngineComparison
-        Another engine on its loops.
+        Its norms by another engine.
     between : BetweenSamples or None
         S between the samples of a loop that was designed as sampled.
     robust : RobustCheck or None
-        All along the case's own set, of a design that is judged on its model alone.
+        A dense check of the case's own set, of a design whose judge takes its model alone.
     """
 
     problem: CoDesignProblem
@@ -83,8 +84,8 @@ class Verified(ABC):
     between: "BetweenSamples | None" = None
     robust: RobustCheck | None = None
 
-    kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
-    saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards
+    kkt_level: ClassVar[float]  # KKT residual over ‖∇J‖∞, up to which it counts as stationary
+    saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is not a saddle's
 
     @property
     def controller(self) -> StateSpace:
@@ -93,7 +94,7 @@ class Verified(ABC):
 
     @property
     def certified(self) -> bool:
-        """Whether the closed loop is, apart from θ."""
+        """Whether the closed loop is certified, whatever λ(θ) is."""
         return self.design.certified
 
     @property
@@ -103,7 +104,8 @@ class Verified(ABC):
 
     @property
     def point(self) -> Array:
-        """The input of the formulation's surrogates: θ, and their other inputs."""
+        """The input of the formulation's surrogates, which take as many of it as they have: θ, with
+        mixed sensitivity ln ω_S and ln ω_T (rad/s) after it."""
         return np.array(self.theta)
 
     @property
@@ -117,12 +119,12 @@ class Verified(ABC):
 
     @abstractmethod
     def evidence(self, predicted: float) -> dict[str, Any]:
-        """Return the further evidence of this kind, by keys of result.json; `predicted` is of its
-        value."""
+        """Return the further evidence of this kind, by keys of result.json; `predicted` is v by the
+        surrogate."""
 
     def largest_at(self, bounds: Bounds, peak_hz: float) -> dict[str, tuple[str, float]]:
-        """Find the plant of the design on which each figure of the judge is largest, in words, and
-        the frequency (Hz); `peak_hz` is that of |S| of one plant."""
+        """Find where each figure of the judge is largest: the plant in words, empty where there is
+        one, and the frequency in Hz; `peak_hz` is that of the peak of |S| on one plant."""
         return {"S_max": ("", peak_hz), "S_low": ("", bounds.omega_low / HZ)}
 
     def proven_figures(self) -> set[str]:
@@ -130,11 +132,11 @@ class Verified(ABC):
         return set()
 
     def checks(self) -> dict[str, bool]:
-        """Checks besides those that every design passes."""
+        """Further checks of this kind by name, each whether the design passes it."""
         return {}
 
     def controller_entry(self) -> dict[str, Any]:
-        """Write controller.json."""
+        """Return the content of controller.json."""
         return controller_dict(self.controller)
 
     @abstractmethod
@@ -178,7 +180,7 @@ class Verified(ABC):
         return judge_on_model(self.problem, self.theta, self.controller)
 
     def bound(self) -> Finding:
-        """State the bound that no controller exceeds at θ."""
+        """State the bound that no controller exceeds at θ: by default that none is known."""
         return Reason.GAP_UNKNOWN()
 
 
@@ -191,8 +193,8 @@ class Solution(NotebookHtml):
     result, outcome : dict, FormulationResult
         The content of result.json, and how the formulation ended.
     verified, quality : Verified or None, tuple of Quality
-        The design (None: infeasible), and its surrogates.
-    problem : CoDesignProblem
+        The design (None: infeasible, or searched and not judged), and that of its surrogates.
+    problem : CoDesignProblem or None
         The one solved: of a robust case that leaves its design plant open, the best one's.
     """
 
@@ -210,5 +212,6 @@ class Solution(NotebookHtml):
         `surrogates.to_casadi` makes functions of them.
         """
         names = outputs_of(BANDWIDTH if self.problem is None else self.problem.figure)
+        # nested fits the first output alone, lifted all, direct none
         pairs = zip(names.items(), self.outcome.surrogates, strict=False)
         return {name: (process, unit) for (name, unit), process in pairs}

@@ -20,12 +20,12 @@ from ccd_casadi.fixed_structure.multi_start import (
     BandwidthOptimum,
     MultiStartOptions,
     SearchRun,
-    arrivals,
-    distinct,
-    finish,
+    count_arrivals,
     local_optima,
     reinsert,
     search_from_starts,
+    select_distinct,
+    select_ends,
 )
 from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redraw_section, stabilising
@@ -242,7 +242,7 @@ class DesignSearch:
     def conclude(self, runners: Sequence[SearchRun], starts: int, spent: int = 0) -> SectionsDesign:
         """The best end that the judge confirms, brought within its bounds; `spent`: loops that were
         assessed before."""
-        problem, ends = self.problem, finish(runners, self.options.multi_start)
+        problem, ends = self.problem, select_ends(runners, self.options.multi_start)
         evaluations = spent + sum(runner.evaluations for runner in runners)
         best: SectionsDesign | None = None
         optima = local_optima(problem, ends, self.options.multi_start)
@@ -324,7 +324,7 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         return search.conclude(first, started)
     runners = _rework(search, problem, first, rng)
     # known ones may be alike
-    found, batch = arrivals(first, runners[0], rules) - max(known - 1, 0), 0
+    found, batch = count_arrivals(first, runners[0], rules) - max(known - 1, 0), 0
     least = min(options.least_starts, search.most_starts)
     while started < least or (found < options.repeats and started + starts <= search.most_starts):
         if ends_early("controller start", starts):
@@ -333,15 +333,15 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         rng = np.random.default_rng((search.seed, batch))
         pool = _pool(problem, starts, rng, workers, options)
         started += len(pool)
-        before, best = arrivals(runners, runners[0], rules), runners[0]
+        before, best = count_arrivals(runners, runners[0], rules), runners[0]
         field = search_from_starts(
             problem, pool, search.log, workers, runners, last=False, options=rules
         )
         if field[0].merit > best.merit + rules.same:
             runners = _rework(search, problem, field, rng)
-            found = arrivals(field, runners[0], rules)
+            found = count_arrivals(field, runners[0], rules)
         else:
-            runners, found = field, found + max(arrivals(field, field[0], rules) - before, 0)
+            runners, found = field, found + max(count_arrivals(field, field[0], rules) - before, 0)
     return replace(search.conclude(runners, started), found=found)
 
 
@@ -355,7 +355,7 @@ def _rework(
         if time_is_up():
             break
         best = runners[0].merit
-        ends = distinct(runners, options.reworked, options.multi_start)
+        ends = select_distinct(runners, options.reworked, options.multi_start)
         fresh = [end for end in ends if not any(end is other for other in tried)]
         tried += fresh
         count = max(search.starts // 2, 1)

@@ -1,5 +1,9 @@
 """A multi-start search: local searches by successive halving, and ends continued with one section
-moved."""
+moved.
+
+A local search climbs in τ = ln(ω_b/ω₀) over κ, the logarithms of a controller's parameters. Its
+merit is τ less a penalty of the violated bounds, so that gains of merit are of ln ω_b.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +32,7 @@ from ccd_casadi.support.time_budget import ends_early
 class ReinsertionOptions:
     """Numbers of the search for a better place of one section."""
 
-    cancels: float = 0.5  # ln of a zero over a pole: nearer ones are taken out
+    cancels: float = 0.5  # ln of a zero over a pole: nearer ones cancel
     places: int = 24  # frequencies of the box that are tried
     dampings: tuple[float, ...] = (0.05, 0.2, 0.8)  # of biquads, where the structure allows them
     step: float = 0.3  # ln: how far a pole may move; a light one no further than its half width
@@ -37,17 +41,24 @@ class ReinsertionOptions:
 def reinsert(
     problem: Problem, ends: Sequence[Point], options: ReinsertionOptions = ReinsertionOptions()
 ) -> Array:
-    """(N, n) controllers like those at the ends, each with one section that cancels."""
-    found = [kappa for end in ends for kappa in _of_one(problem, end, options)]
+    """(N, n) controllers like those at the ends, each with one section moved, where it cancels.
+
+    At an end a zero near a pole does little, and a section whose zeros are its poles does nothing,
+    wherever it is. So it is taken out and put where it promises most. With the multipliers μ of
+    the bounds c(κ, τ) <= 0 that are active, to first order τ grows by -μᵀ(∂c/∂κ) Δκ: a pole that
+    moves off its zero by Δκ, of the sign that helps, promises |μᵀ∂c/∂κ| |Δκ|.
+    """
+    found = [kappa for end in ends for kappa in _reinsert_at(problem, end, options)]
     return np.clip(np.reshape(found, (-1, len(problem.box[0]))), *problem.box)
 
 
-def _of_one(problem: Problem, end: Point, options: ReinsertionOptions) -> list[Array]:
+def _reinsert_at(problem: Problem, end: Point, options: ReinsertionOptions) -> list[Array]:
+    """Those of one end: with the zero and pole that are nearest, and with each biquad."""
     step, count = options.step, options.places
     names, kinds, kappa = problem.structure.names, problem.structure.kinds, end.kappa
     if ParameterKind.FREQUENCY not in kinds:
         return []
-    # Of an end outside its bounds those count that it misses most.
+    # Of an end outside its bounds those that it misses most are active: the largest is moved to 0.
     peaks, over = end.assessment.peaks, end.assessment.violation
     assert peaks is not None
     shifted = replace(end.assessment, peaks=replace(peaks, value=peaks.value - over))
@@ -57,16 +68,17 @@ def _of_one(problem: Problem, end: Point, options: ReinsertionOptions) -> list[A
     zeros = [i for i, name in enumerate(names) if name.endswith((" zero", "integrator"))]
     poles = [i for i, name in enumerate(names) if name.endswith((" pole", "roll-off real"))]
     pairs = [(abs(kappa[z] - kappa[p]), z, p) for z in zeros for p in poles]
+    apart, z, p = min(pairs, default=(np.inf, 0, 0))
     found: list[Array] = []
-    if pairs and min(pairs)[0] < options.cancels:
-        _, z, p = min(pairs)
+    if apart < options.cancels:
         tried = np.tile(kappa, (count, 1))
         tried[:, z] = tried[:, p] = places
-        if names[z] == "integrator":  # k ω_i stays
+        if names[z] == "integrator":  # (s + ω_i)/s: the gain at low frequencies, k ω_i, stays
             tried[:, 0] += kappa[z] - places
-        found.append(_best(problem, end, known, tried, [p], np.full((count, 1), step)))
+        steps = np.full((count, 1), step)
+        found.append(_most_promising(problem, end, known, tried, [p], steps))
     for i in range(1, problem.structure.biquads + 1):
-        z = names.index(f"biquad {i} zeros")
+        z = names.index(f"biquad {i} zeros")  # and their damping, the poles and theirs
         least = np.exp(problem.box[0, z + 1])
         dampings = np.log(np.unique(np.maximum(options.dampings, least)))
         tried = np.tile(kappa, (count * len(dampings), 1))
@@ -74,21 +86,21 @@ def _of_one(problem: Problem, end: Point, options: ReinsertionOptions) -> list[A
         tried[:, z + 1] = tried[:, z + 3] = np.tile(dampings, count)
         steps = np.column_stack([np.minimum(np.exp(tried[:, z + 1]), step),
                                  np.full(len(tried), step)])  # fmt: skip
-        found.append(_best(problem, end, known, tried, [z + 2, z + 3], steps))
+        found.append(_most_promising(problem, end, known, tried, [z + 2, z + 3], steps))
     return found
 
 
-def _best(
+def _most_promising(
     problem: Problem, end: Point, known: Optimality, tried: Array, poles: list[int], steps: Array
 ) -> Array:
-    """The one of `tried` (N, n) whose `poles`, moved by `steps`, promise most."""
+    """The one of `tried` (N, n) whose `poles`, moved by `steps` (N, poles), promise most."""
     mu = known.multipliers[: len(known.kinds)]
     slopes = [mu @ constraints(problem, kappa, end.tau, known.active).to_kappa[:, poles]
               for kappa in tried]  # fmt: skip
     return tried[np.argmax((np.abs(slopes) * steps).sum(axis=1))]
 
 
-OF_BANDWIDTH = (LoopCurve.SHAPE, LoopCurve.LEVEL, LoopCurve.CROSSING)
+OF_BANDWIDTH = (LoopCurve.SHAPE, LoopCurve.LEVEL, LoopCurve.CROSSING)  # bounds that move with ω_b
 
 
 @dataclass(frozen=True)
@@ -128,10 +140,16 @@ class BandwidthOptimum:
 
 @dataclass(frozen=True)
 class SearchRun(Ascent):
-    """One search: where it is, with the loops assessed in all, and what its last round gained,
-    or where that ended in a crawl gains at this rate.
+    """One search between two rounds; its `evaluations` are those of all rounds.
 
-    `running`: it continues. `count`: searches that were merged into it.
+    Attributes
+    ----------
+    gained : float
+        Merit in the last round; where that ended in a crawl, what a round gains at its rate.
+    running : bool
+        Whether it continues.
+    count : int
+        Searches that were merged into it, itself included.
     """
 
     gained: float = np.inf
@@ -167,6 +185,7 @@ def search_from_starts(
     before : sequence of SearchRun
         Searches of before, which are in the field too and have to be overtaken.
     known : int
+        Of `pool`.
     last : bool
         Whether no multi-start search follows; else one that runs alone and gains little is left
         to it.
@@ -191,7 +210,7 @@ def search_from_starts(
         others = [runner for runner in field if not runner.running]
         field = others + _climb_all(problem, running, workers, options)
         field = _merge(sorted(field, key=lambda runner: -runner.merit))
-        field = _going_on(field, turn, options)
+        field = _stop_losers(field, turn, options)
         lead, going = field[0].point, sum(runner.running for runner in field)
         over = lead.assessment.violation
         exceeded = f"bounds exceeded by {100.0 * over:.1g} %"
@@ -220,20 +239,30 @@ def start_at(
     return own if inside else first
 
 
+@dataclass(frozen=True)
+class OwnBandwidthOptions:
+    """Numbers of the search for the bandwidth that a controller has; τ is a logarithm."""
+
+    steps: int = 16  # of Newton's method, at most
+    least_slope: float = 1e-3  # ∂c/∂τ below which -3 dB is touched from below, and not crossed
+    furthest: float = 1.0  # in τ: a step at most
+    wider: float = 0.1  # in τ: a step where Newton's leads back to where all was met
+
+
 def at_its_bandwidth(
     problem: LoopProblem,
     kappa: Array,
     tau: float | None = None,
     within: float = MultiStartOptions.violation,
-    *,
-    steps: int = 16,
-    least_slope: float = 1e-3,
+    options: OwnBandwidthOptions = OwnBandwidthOptions(),
 ) -> Point:
     """Find the largest ω_b that the shape and -3 dB leave a controller by safeguarded Newton steps.
 
-    A climb from a known controller begins there: from below it would first make another one of it,
-    and end in another optimum. Where |S| falls again beyond a peak below -3 dB Newton's steps may
-    lead away from the crossing, which stays between the ω_b that were met and missed.
+    Of the bounds c(τ) <= 0 that rise with τ the first root is the bandwidth; Newton's step leads to
+    the nearest -c/(∂c/∂τ). A climb from a known controller begins there: from below it would first
+    make another one of it, and end in another optimum. Where |S| falls again beyond a peak below
+    -3 dB Newton's steps may lead away from the crossing, which stays between the ω_b that were met
+    and missed: then these are halved.
 
     Parameters
     ----------
@@ -243,32 +272,33 @@ def at_its_bandwidth(
         ln(ω_b/ω₀) to begin with; by default `problem.begin`.
     within : float
         ln of a bound, by which it may be exceeded.
-    steps, least_slope : int, float
-        Newton steps at most; ∂c/∂τ below which -3 dB is touched from below, and not crossed.
+    options : OwnBandwidthOptions
 
     Returns
     -------
     Point
     """
     tau, met, missed = problem.begin(kappa) if tau is None else tau, -np.inf, np.inf
-    for _ in range(steps):
+    furthest = options.furthest
+    for _ in range(options.steps):
         point = Point(kappa, tau, assess(problem, kappa, tau))
         peaks = point.assessment.peaks
         if peaks is None:
             break
         over = bool((peaks.value[np.isin(peaks.curve, OF_BANDWIDTH)] > within).any())
-        rising = peaks.to_tau > least_slope
-        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=1.0))
+        rising = peaks.to_tau > options.least_slope
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=furthest))
         if abs(room) < within and not over:
             break
         met, missed = (met, tau) if over else (tau, missed)
-        tau += float(np.clip(room, -1.0, 1.0))
-        if not met < tau < missed:
-            tau = 0.5 * (max(met, missed - 2.0) + missed) if np.isfinite(missed) else met + 0.1
+        tau += float(np.clip(room, -furthest, furthest))
+        if not met < tau < missed:  # halved, from within the longest step below what was missed
+            below = max(met, missed - 2.0 * furthest)
+            tau = 0.5 * (below + missed) if np.isfinite(missed) else met + options.wider
     return point
 
 
-def arrivals(
+def count_arrivals(
     runners: Sequence[SearchRun], best: SearchRun, options: MultiStartOptions = MultiStartOptions()
 ) -> int:
     """Count the searches that reached the bandwidth of the best one, within its bounds."""
@@ -279,10 +309,10 @@ def arrivals(
     )  # fmt: skip
 
 
-def finish(
+def select_ends(
     runners: Sequence[SearchRun], options: MultiStartOptions = MultiStartOptions()
 ) -> list[SearchRun]:
-    """Select the searches whose steps help no longer, and the best.
+    """Select the searches whose steps help no longer, and the best `kept`.
 
     Parameters
     ----------
@@ -298,12 +328,12 @@ def finish(
     return [runner for i, runner in enumerate(runners) if runner.done or i < options.kept]
 
 
-def distinct(
+def select_distinct(
     runners: Sequence[SearchRun], count: int, options: MultiStartOptions = MultiStartOptions()
 ) -> list[Point]:
     """The best `count` ends of unequal bandwidth, those outside the bounds last."""
     found: list[SearchRun] = []
-    for runner in finish(runners, options):
+    for runner in select_ends(runners, options):
         if all(abs(runner.point.tau - other.point.tau) > options.same for other in found):
             found.append(runner)
     return [runner.point for runner in found[:count]]
@@ -347,7 +377,10 @@ def _climb_all(
 def _climb(
     problem: LoopProblem, point: Point, radius: float, options: MultiStartOptions
 ) -> tuple[Ascent, float]:
-    """A round of a climb, and what it gained; at the rate of its last steps where these crawl."""
+    """A round of a climb, and what it gained; at the rate of its last steps where these crawl.
+
+    The gain of the whole round would show a crawl a round too late.
+    """
     steps, last = options.steps, options.recent
     before = ascend(problem, point, iterations=steps - last, radius=radius)
     if before.done:
@@ -374,8 +407,17 @@ def _merge(field: Sequence[SearchRun]) -> list[SearchRun]:
     return kept
 
 
-def _going_on(field: Sequence[SearchRun], turn: int, options: MultiStartOptions) -> list[SearchRun]:
-    """The field, best first, with those stopped that lost, or will not meet the bounds."""
+def _stop_losers(
+    field: Sequence[SearchRun], turn: int, options: MultiStartOptions
+) -> list[SearchRun]:
+    """The field, best first, with those stopped that lost, or will not meet the bounds.
+
+    A search has lost if halving cuts it off, or if it is so far behind the best that it would catch
+    up only at several times the gain of its last round. The best is spared, and until halving is
+    over that one outside its bounds whose bandwidth is the largest, clearly above that of the best:
+    its merit is low for its violation, which a climb may remove. A search is hopeless if its
+    violation would take several times that gain.
+    """
     running = [i for i, runner in enumerate(field) if runner.running]
     most = max(options.kept, len(running) // 2) if turn in options.halvings else len(running)
     lead, found = field[0].merit, list(field)

@@ -23,12 +23,12 @@ class FigureOfMerit:
     Attributes
     ----------
     key, words, symbol : str
-        Its value of `minimise`; its name; its symbol.
+        What a case names it by (`minimise`); its name in words; its symbol in formulas.
     si_unit, unit, factor : str, str, float
-        v times `factor` is in `unit`, which is shown.
+        v is in `si_unit`, v times `factor` in `unit`, which is shown.
     larger_is_better : bool
     entry : str
-        Its stem in result.json.
+        Its stem in the keys of result.json.
     """
 
     key: str
@@ -40,10 +40,11 @@ class FigureOfMerit:
     larger_is_better: bool
     entry: str
 
-    def gain(self, other: float, than: float) -> float:
-        """Compute by how much (relative) a value is better than another; negative where it is
+    def gain(self, value: float, reference: float) -> float:
+        """Compute by how much (relative) a value is better than a reference; negative where it is
         worse."""
-        return (other / than if self.larger_is_better else than / other) - 1.0
+        better, worse = (value, reference) if self.larger_is_better else (reference, value)
+        return better / worse - 1.0
 
     def format_value(self, value: float, digits: int = 4) -> str:
         """The value with its unit, a length or a time with the prefix that its size needs.
@@ -51,7 +52,7 @@ class FigureOfMerit:
         >>> RMS_ERROR.format_value(12.3456e-9)
         '12.35 nm'
         """
-        if self is BANDWIDTH:
+        if self is BANDWIDTH:  # in Hz without a prefix, as everywhere
             return f"{self.factor * value:.{digits}g} {self.unit}"
         return with_unit(value, spoken(self.si_unit), digits)
 
@@ -64,22 +65,18 @@ MOVE_TIME = FigureOfMerit("move_time", "move time", "t", "s", "ms", 1e3, False, 
 FIGURES = {figure.key: figure for figure in (BANDWIDTH, RMS_ERROR, MOVE_TIME)}
 
 
-Options = tuple[tuple[str, object], ...]
+Options = tuple[tuple[str, object], ...]  # of a plant: (name, value), sorted by name
 
 
 @dataclass(frozen=True)
 class ControllerProblem:
     """The statement of the controller in a problem; the base of all kinds.
 
-    By default a continuous controller of largest bandwidth, on the plant of the case alone.
+    What a kind does not override is that of a continuous controller of largest bandwidth, on the
+    plant of the case alone.
 
     Attributes
     ----------
-    figure : FigureOfMerit
-        What J counts of the controller.
-    sampling : Sampling or None
-    bandwidth_least : float
-    plant_options : tuple of options
     kernels : tuple of str
         Groups of compiled kernels that its searches need.
     """
@@ -88,7 +85,7 @@ class ControllerProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader of a result must know of it."""
+        """What a reader of a result must know of it, in sentences."""
         return ()
 
     @property
@@ -103,7 +100,7 @@ class ControllerProblem:
 
     @property
     def bandwidth_least(self) -> float:
-        """Below which no design counts, rad/s."""
+        """The bandwidth below which no design counts, rad/s."""
         return 0.0
 
     @property
@@ -121,12 +118,12 @@ class ControllerProblem:
 
 @dataclass(frozen=True)
 class MixedSensitivityProblem(ControllerProblem):
-    """An H∞ controller by the weights W_S, W_KS and W_T: the problem states all of it.
+    """An H∞ controller by the weights W_S, W_KS and W_T, which the problem itself states.
 
     Attributes
     ----------
     kernels : tuple of str
-        Groups of compiled kernels that it needs.
+        Groups of compiled kernels that its searches need.
     """
 
     kernels: ClassVar[tuple[str, ...]] = ("synthesis",)
@@ -140,9 +137,9 @@ class RobustSet:
     ----------
     shift, shifts : float, int
         Frequencies of the flexible modes are multiplied by 1 + s, `shifts` values of s evenly over
-        ±`shift`.
+        ±`shift`; both are in the set, so that `shifts` is 2 or more, or 1 where `shift` is 0.
     damping : tuple of float
-        With every s damping is multiplied by each of these factors.
+        With every s damping is multiplied by 1 and by each of these factors.
     design_shift : float or None
         s of the plant that the controller is designed on; None: both ends and the middle are tried
         (`design_choices`).
@@ -154,7 +151,7 @@ class RobustSet:
     design_shift: float | None
 
     def perturbations(self, shifts: int | None = None) -> tuple[Perturbation, ...]:
-        """The set; `shifts` of them for a denser one."""
+        """The set, (s, factor of damping) each; with `shifts` values of s for a denser one."""
         values = np.linspace(-self.shift, self.shift, self.shifts if shifts is None else shifts)
         factors = sorted({1.0, *self.damping})
         return tuple(Perturbation(float(s), z) for s in values for z in factors)
@@ -167,7 +164,8 @@ class RobustSet:
         return ("low", "nominal", "high")[1 + int(np.sign(self.design_shift))]
 
     def scale(self, share: float) -> "RobustSet":
-        """The set that reaches a share of this one's way, from the model alone (0) to it (1)."""
+        """The set that reaches a share, above 0, of this one's way from the model alone: s and the
+        logarithm of a factor of damping are in proportion to it."""
         design = None if self.design_shift is None else share * self.design_shift
         damping = tuple(factor**share for factor in self.damping)
         return RobustSet(share * self.shift, self.shifts, damping, design)

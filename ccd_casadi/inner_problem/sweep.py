@@ -44,6 +44,12 @@ class SweepOptions:
         ln ω: closer to an uncertified design no better one is searched.
     starts : int
         Local solves at most.
+    penalty : float
+        ln ω_b per ln of a violated bound, where starts are compared.
+    syntheses, steps : int
+        Of a local solve, and of SLSQP within it, at most.
+    tolerance : float
+        SLSQP's, of ln ω_b.
     active : float
         Relative distance within which a constraint counts as binding.
     """
@@ -51,6 +57,10 @@ class SweepOptions:
     margin: float = 1e-9
     near: float = 1e-3
     starts: int = 6
+    penalty: float = 3.0
+    syntheses: int = 40
+    steps: int = 30
+    tolerance: float = 1e-9
     active: float = 1e-5
 
 
@@ -83,7 +93,8 @@ class InnerBounds:
 
     @property
     def bounds(self) -> dict[str, tuple[str, float]]:
-        """Name of each bound -> the figure that it is on, the bound; as in `values[1:-1]`."""
+        """Name of each bound -> the figure that it is on, the bound, in the order of
+        `Sensitivities.values[1:-1]`."""
         found = {
             "S_max": ("sensitivity_peak", self.S_max),
             "S_low": ("sensitivity_low", self.S_low),
@@ -107,7 +118,8 @@ class InnerBounds:
         }
 
     def excess(self, figures: object) -> float:
-        """ln of the largest figure over its bound, of a row or a stored sample; 0 is feasible."""
+        """ln of the largest figure over its bound, of a row or a stored sample; feasible up to 0,
+        NaN where a figure is."""
         bounds = self.bounds.values()
         return float(np.max([np.log(getattr(figures, name) / bound) for name, bound in bounds]))
 
@@ -118,8 +130,10 @@ class InnerBounds:
         )
 
     def frequencies(self, x: Sequence[float] | Array) -> Point:
-        """Return the frequencies from their logarithms, the last two of x; exp(log(bound)) may miss
-        it by rounding."""
+        """Return the frequencies from their logarithms, the last two of x, which may begin with θ.
+
+        They are clipped to the box, since exp(log(bound)) may miss a bound by rounding.
+        """
         S, T = np.clip(np.exp(x[-2]), *self.omega_S), np.clip(np.exp(x[-1]), *self.omega_T)
         return float(S), float(T)
 
@@ -174,11 +188,12 @@ def refine(
     problem: InnerBounds,
     rows: Sequence[DesignFigures],
     starts: Iterable[Point],
-    limit: int = 40,
+    limit: int = SweepOptions.syntheses,
 ) -> InnerResult:
     """Local constrained solves from `starts` (rad/s); the best feasible design of all wins.
 
-    `limit` bounds the syntheses of each local solve.
+    `limit` bounds the syntheses of each local solve. A row has no derivatives: where the fastest
+    feasible one is faster than every end, its design is made anew, with them.
     """
     steps = [step for start in starts for step in local_solve(at, problem, start, limit)]
     tried = [*rows, *(step.figures for step in steps)]
@@ -190,7 +205,7 @@ def refine(
             break
         other = at((row.omega_S, row.omega_T))
         tried.append(other.figures)
-        if problem.feasible(other.figures):  # not where its derivatives are lost
+        if problem.feasible(other.figures):  # it is not where derivatives are not finite
             best = other
             break
     if best is None:
@@ -219,41 +234,48 @@ def evaluate(
     return sensitivities(plant, weights.at(*point), **problem.synthesis_options)
 
 
-def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[Point]:
-    """Local maxima of ln ω_b - 3·violation over the sweep grid, best first.
+def sweep_starts(
+    problem: InnerBounds, rows: Sequence[DesignFigures], options: SweepOptions = SweepOptions()
+) -> list[Point]:
+    """Local maxima of ln ω_b - penalty·violation over the eight neighbours on the sweep grid, best
+    first.
 
     Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
     """
     merit = np.array([
-        np.log(row.bandwidth) - 3.0 * _violation(problem, row) if row.certified else -np.inf
-        for row in rows
+        np.log(row.bandwidth) - options.penalty * _violation(problem, row)
+        if row.certified else -np.inf for row in rows
     ])  # fmt: skip
     merit = np.nan_to_num(merit, nan=-np.inf)  # an unknown figure is no merit
     around = np.pad(merit.reshape(problem.sweep_points), 1, constant_values=-np.inf)
     highest = sliding_window_view(around, (3, 3)).max(axis=(2, 3)).ravel()
     found = np.flatnonzero(np.isfinite(merit) & (merit >= highest))
-    best = found[np.argsort(-merit[found], kind="stable")][: SweepOptions.starts]
+    best = found[np.argsort(-merit[found], kind="stable")][: options.starts]
     return [(rows[i].omega_S, rows[i].omega_T) for i in best]
 
 
 def _violation(problem: InnerBounds, row: DesignFigures) -> float:
-    return float(np.maximum(0.0, problem.excess(row)))
+    """ln of the largest figure over its bound, 0 within all; infinite where a figure is unknown."""
+    excess = problem.excess(row)
+    return np.inf if np.isnan(excess) else max(0.0, excess)
 
 
-class _Uncertified(Exception):
-    """Raised through SLSQP, which takes no point for one that has no figures."""
+class _Stop(Exception):
+    """Raised through SLSQP, which cannot step over a design without figures, or beyond a limit."""
 
 
 def local_solve(
-    made_at: At, problem: InnerBounds, start: Point, limit: int = 40
-) -> list[Sensitivities]:
+    made_at: At, problem: InnerBounds, start: Point, limit: int = SweepOptions.syntheses,
+    options: SweepOptions = SweepOptions(),
+) -> list[Sensitivities]:  # fmt: skip
     """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way.
 
     Where a step ends in an uncertified design, the search continues from the best one so far in a
-    box that reaches half way to there.
+    box that reaches half way to the nearest of these, until that is `near` or a solve changes
+    nothing.
     """
     bounds = np.log([problem.omega_S, problem.omega_T])
-    levels = problem.levels - SweepOptions.margin
+    levels = problem.levels - options.margin
     seen: dict[tuple[float, float], Sensitivities] = {}
 
     def at(x: Array) -> Sensitivities:
@@ -261,14 +283,15 @@ def local_solve(
         key = (float(clipped[0]), float(clipped[1]))
         if key not in seen:
             if len(seen) >= limit:
-                raise _Uncertified
+                raise _Stop
             seen[key] = made_at(problem.frequencies(clipped))
         if not seen[key].figures.certified:
-            raise _Uncertified
+            raise _Stop
         return seen[key]
 
     def climbed(x: Array, low: Array, high: Array) -> bool:
-        """Whether SLSQP ended without an uncertified design on the way."""
+        """Whether SLSQP ended by itself; of `values` and its gradients the first is ω_b, the last
+        γ_opt, and between them are the logarithms of what is bounded."""
         try:
             scipy.optimize.minimize(
                 lambda x: -np.log(at(x).values[0]),
@@ -281,9 +304,9 @@ def local_solve(
                     "jac": lambda x: -at(x).to_break_frequencies[1:-1],
                 },
                 method="SLSQP",
-                options={"ftol": 1e-9, "maxiter": 30},
+                options={"ftol": options.tolerance, "maxiter": options.steps},
             )
-        except _Uncertified:
+        except _Stop:
             return False
         return True
 
@@ -299,10 +322,9 @@ def local_solve(
             break
         best = np.array(min(certified, key=rank))
         half = 0.5 * float(np.abs(np.array(lost) - best).max(axis=1).min())
-        if half < SweepOptions.near or (ended and np.array_equal(best, x)):
+        if half < options.near or (ended and np.array_equal(best, x)):
             break
-        x, low, high = best, np.maximum(bounds[:, 0], best - half), best + half
-        high = np.minimum(bounds[:, 1], high)
+        x, low, high = best, *np.clip([best - half, best + half], *bounds.T)
     return list(seen.values())
 
 
@@ -346,7 +368,7 @@ def shortfall(problem: InnerBounds, rows: Sequence[DesignFigures]) -> str:
     kept, least, elsewhere = [], [], []
     for name, (attribute, bound) in problem.bounds.items():
         value = float(getattr(nearest, attribute))
-        best = min(float(getattr(row, attribute)) for row in certified)
+        best = float(np.fmin.reduce([getattr(row, attribute) for row in certified]))  # no NaN
         if value <= bound:
             kept.append(f"{name} = {bound:g} is kept there with {value:.4g}")
         elif best <= bound:
@@ -396,6 +418,6 @@ def missed_by(value: float, bound: float) -> str:
     '2.0004 (+0.02 %)'
     """
     digits = 4
-    while digits < 15 and float(f"{value:.{digits}g}") == float(f"{bound:.{digits}g}"):
+    while digits < 17 and float(f"{value:.{digits}g}") == float(f"{bound:.{digits}g}"):
         digits += 1
     return f"{value:.{digits}g} ({100.0 * (value / bound - 1.0):+.2g} %)"

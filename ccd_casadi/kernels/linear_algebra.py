@@ -1,5 +1,9 @@
-"""Linear algebra of the kernels: LAPACK wrappers, and matrices of one to three rows in closed
-form."""
+"""Linear algebra of the kernels: LAPACK wrappers, and loops for complex matrices of a few rows.
+
+LAPACK counts by columns: a C array A.T.copy() is A to it, and what it leaves is read transposed.
+"""
+
+from typing import NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -11,6 +15,25 @@ from ccd_casadi.kernels.compiled import compiled, inlined
 _F = types.CPointer(types.float64)
 _I = types.CPointer(types.int32)
 _C = types.CPointer(types.uint8)
+_N, _S, _T, _V = b"NSTV"  # LAPACK's letters: no, scale, transposed, vectors
+
+
+class JacobiOptions(NamedTuple):
+    """Numbers of the singular values by Jacobi's rotations.
+
+    Attributes
+    ----------
+    cosine : float
+        Between columns that count as orthogonal.
+    sweeps : int
+        Over all pairs of columns, at most; they converge quadratically.
+    """
+
+    cosine: float = 1e-14
+    sweeps: int = 30
+
+
+JACOBI = JacobiOptions()
 
 
 def _external(name: str, *args: types.Type) -> types.ExternalFunction:
@@ -47,16 +70,16 @@ def _char(value):
 
 @compiled
 def _schur(F):
-    """dgees in place: F holds Aᵀ in C order, which is A to LAPACK, and leaves as Tᵀ; with Qᵀ."""
+    """dgees in place: F is A to LAPACK and leaves as Tᵀ; with Qᵀ. Eigenvalues are not sorted."""
     n = F.shape[0]
     V = np.empty((n, n))
     wr, wi = np.empty(n), np.empty(n)
-    lwork = 32 * n + 4224  # what dgehrd wants for its blocks
+    lwork = 32 * n + 4224  # blocks of 32 for n columns, and dgehrd's 65 x 64
     work = np.empty(lwork)
     info, sdim, logical = _int(0), _int(0), np.zeros(max(1, n), np.int32)
     N = _int(n)
     _dgees(
-        _char(86).ctypes, _char(78).ctypes, logical.ctypes, N.ctypes, F.ctypes, N.ctypes,
+        _char(_V).ctypes, _char(_N).ctypes, logical.ctypes, N.ctypes, F.ctypes, N.ctypes,
         sdim.ctypes, wr.ctypes, wi.ctypes, V.ctypes, N.ctypes, work.ctypes,
         _int(lwork).ctypes, logical.ctypes, info.ctypes,
     )  # fmt: skip
@@ -78,7 +101,7 @@ def balance(A):
     n = F.shape[0]
     N, low, high, info, scale = _int(n), _int(0), _int(0), _int(0), np.ones(n)
     _dgebal(
-        _char(83).ctypes, N.ctypes, F.ctypes, N.ctypes, low.ctypes, high.ctypes, scale.ctypes,
+        _char(_S).ctypes, N.ctypes, F.ctypes, N.ctypes, low.ctypes, high.ctypes, scale.ctypes,
         info.ctypes,
     )  # fmt: skip
     return F.T.copy(), scale
@@ -98,15 +121,16 @@ def solve(A, B):
 
 @compiled
 def stable_subspace(H):
-    """Schur form of a 2N x 2N matrix, reordered with its left-half-plane part first.
+    """Schur form of a 2N x 2N Hamiltonian, reordered with its left-half-plane part first.
 
-    Returns T11 (N x N, quasi upper triangular), U1, U2 (N x N) with
-    H [U1; U2] = [U1; U2] T11, the smallest |Re λ|/max(|λ|, tiny), and ok: False where the
-    spectrum does not split N to N, or LAPACK reports a failure.
+    X = U2 U1⁻¹ is the stabilising solution of its Riccati equation (Laub, 1979). Returns T11
+    (N x N, quasi upper triangular), U1, U2 (N x N) with H [U1; U2] = [U1; U2] T11, the smallest
+    |Re λ|/|λ|, how far the spectrum is from the axis, and ok: False where it does not split N to N,
+    or LAPACK reports a failure.
     """
     n = H.shape[0]
     half = n // 2
-    T = H.T.copy()  # from here on every matrix is held transposed, as LAPACK counts
+    T = H.T.copy()  # from here on T and Q are held transposed
     Q, wr, wi, info = _schur(T)
     gap = np.inf
     count = 0
@@ -123,7 +147,7 @@ def stable_subspace(H):
         s, sep, work = np.zeros(1), np.zeros(1), np.empty(max(1, n))
         iwork, lwork, flag = np.zeros(1, np.int32), _int(max(1, n)), _int(0)
         _dtrsen(
-            _char(78).ctypes, _char(86).ctypes, select.ctypes, N.ctypes, T.ctypes, N.ctypes,
+            _char(_N).ctypes, _char(_V).ctypes, select.ctypes, N.ctypes, T.ctypes, N.ctypes,
             Q.ctypes, N.ctypes, wr.ctypes, wi.ctypes, m.ctypes, s.ctypes, sep.ctypes,
             work.ctypes, lwork.ctypes, iwork.ctypes, one.ctypes, flag.ctypes,
         )  # fmt: skip
@@ -136,13 +160,15 @@ def stable_subspace(H):
 
 @compiled
 def lyapunov_triangular(T, C, transposed):
-    """Z with Tᵀ Z + Z T = C (transposed) or T Z + Z Tᵀ = C, T quasi upper triangular."""
+    """Z with Tᵀ Z + Z T = C (transposed) or T Z + Z Tᵀ = C, T quasi upper triangular (dtrsyl).
+
+    T is stable, so that no two of its eigenvalues add to 0 and Z is unique.
+    """
     n = T.shape[0]
     F = T.T.copy()
     Z = C.T.copy()
     N, scale, info = _int(n), np.ones(1), _int(0)
-    first = 84 if transposed else 78
-    second = 78 if transposed else 84
+    first, second = (_T, _N) if transposed else (_N, _T)
     _dtrsyl(
         _char(first).ctypes, _char(second).ctypes, _int(1).ctypes, N.ctypes, N.ctypes,
         F.ctypes, N.ctypes, F.ctypes, N.ctypes, Z.ctypes, N.ctypes, scale.ctypes, info.ctypes,
@@ -160,7 +186,7 @@ def eigenvalues(A):
     work = np.empty(lwork)
     N, one, info = _int(n), _int(1), _int(0)
     _dgeev(
-        _char(78).ctypes, _char(78).ctypes, N.ctypes, F.ctypes, N.ctypes, wr.ctypes, wi.ctypes,
+        _char(_N).ctypes, _char(_N).ctypes, N.ctypes, F.ctypes, N.ctypes, wr.ctypes, wi.ctypes,
         dummy.ctypes, one.ctypes, dummy.ctypes, one.ctypes, work.ctypes, _int(lwork).ctypes,
         info.ctypes,
     )  # fmt: skip
@@ -169,7 +195,7 @@ def eigenvalues(A):
 
 @compiled
 def multiply(A, B):
-    """Compute A B."""
+    """Compute A B of matrices of a few rows, real or complex; the product is complex."""
     n, m, count = A.shape[0], B.shape[1], A.shape[1]
     out = np.zeros((n, m), np.complex128)
     for i in range(n):
@@ -215,18 +241,24 @@ def invert(A):
 
 
 @compiled
-def singular(M, rows, columns, V, sigma, vectors):
+def jacobi_svd(M, rows, columns, V, sigma, vectors):
     """M ← M V with orthogonal columns of the lengths σ, the longest first; V is unitary.
 
-    M is the upper left of an array. One-sided Jacobi rotations (Hestenes): small σ come out as
-    exactly as large ones. Without `vectors` V is left alone.
+    M is the upper left of an array. One-sided rotations (Hestenes; Golub and Van Loan, Matrix
+    Computations, 8.6): small σ come out as exactly as large ones. Of columns x and y with a = ‖x‖²,
+    b = ‖y‖², h = xᴴy,
+
+        x' = c x - s̄ y,   y' = s x + c y,   c = 1/√(1 + t²),   s = t c h/|h|,
+
+    are orthogonal if t² + t (b - a)/|h| - 1 = 0; the root of the smaller size turns them by less
+    than 45 degrees, so that the sweeps converge. Without `vectors` V is left alone.
     """
     if vectors:
         for i in range(columns):
             for j in range(columns):
                 V[i, j] = 1.0 if i == j else 0.0
     turned = columns > 1
-    for _ in range(30):
+    for _ in range(JACOBI.sweeps):
         if not turned:
             break
         turned = False
@@ -239,7 +271,7 @@ def singular(M, rows, columns, V, sigma, vectors):
                     b += y.real * y.real + y.imag * y.imag
                     h += x.conjugate() * y
                 square = h.real * h.real + h.imag * h.imag
-                if not square > 1e-28 * a * b:  # their cosine is below 1e-14
+                if not square > JACOBI.cosine**2 * a * b:
                     continue
                 turned = True
                 size = np.sqrt(square)
@@ -280,13 +312,14 @@ def singular(M, rows, columns, V, sigma, vectors):
 def largest_singular(M):
     """σ_max of a matrix, which is overwritten."""
     sigma = np.empty(M.shape[1])
-    singular(M, M.shape[0], M.shape[1], M, sigma, False)
+    jacobi_svd(M, M.shape[0], M.shape[1], M, sigma, False)
     return sigma[0]
 
 
 @inlined
-def largest_gain(M, rows, columns):
-    """Not below any singular value: the root of the largest row sum of |MᴴM|."""
+def gain_bound(M, rows, columns):
+    """An upper bound of σ_max(M), the root of the largest row sum of |MᴴM|: σ_max² = ρ(MᴴM), and
+    no eigenvalue exceeds a norm."""
     sums = np.zeros(columns)
     for i in range(columns):
         for j in range(i + 1):

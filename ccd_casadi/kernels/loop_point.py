@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.linear_algebra import invert, largest_gain, singular
+from ccd_casadi.kernels.linear_algebra import gain_bound, invert, jacobi_svd
 from ccd_casadi.kernels.modes import response
 from ccd_casadi.kernels.sections import (
     GainOf,
@@ -247,15 +247,15 @@ def gain_of(curve, number, into, out, own, kinds, q, lever, of_plant, at, of, si
     if levered:
         rows = z
         moved(into, out, of[K], q, lever, of_plant, at)
-        singular(at[M], rows, columns, at[V], sigma, True)
+        jacobi_svd(at[M], rows, columns, at[V], sigma, True)
     elif number < p:
         matrix(curve, into, out, of[K], q, at)
-        singular(at[M], rows, columns, at[V], sigma, True)
+        jacobi_svd(at[M], rows, columns, at[V], sigma, True)
     else:
         place = 0
         size = own_gain(curve, number - p, into, out, of[K], own, kinds, q, at)
         if kind == GainOf.ROW:
-            singular(at[M], 1, columns, at[V], sigma, True)
+            jacobi_svd(at[M], 1, columns, at[V], sigma, True)
         else:
             columns = rows = m if kind == GainOf.ACTUATOR else p
             sigma[0] = size
@@ -402,7 +402,7 @@ def levels(curves, which, v, loop, least, answers):
                         rows, columns = matrix(curve, into, outputs, k, q, at)
                     top = abs(at[M, 0, 0])
                     if rows + columns > 2:
-                        top = largest_gain(matrix_room, rows, columns)
+                        top = gain_bound(matrix_room, rows, columns)
                     top = np.log(top)
                     height = top if of_s else height
                 level = offset(curve, 0, ω, chain, limits)[0]
@@ -414,7 +414,7 @@ def levels(curves, which, v, loop, least, answers):
                             moved(into, outputs, k, q, lever, which[i], at)
                         else:
                             matrix(curve, into, outputs, k, q, at)
-                        singular(matrix_room, rows, columns, vectors, sigma, False)
+                        jacobi_svd(matrix_room, rows, columns, vectors, sigma, False)
                     for number in range(p):
                         if of_s and not known:
                             sensitivity[number] = sigma[number]

@@ -3,7 +3,10 @@
 Of min J(z) over g(z) <= 0, 0 <= z <= 1 (z: shares of the box of the variables), where A has the
 gradients of the active constraints and bounds as rows:
 
-    ∇J + Aᵀμ = 0,   μ >= 0,   μᵢ gᵢ = 0,   ZᵀHZ >= 0 on the null space Z of rows with μᵢ > 0.
+    ∇J + Aᵀμ = 0,   μ >= 0,   μᵢ gᵢ = 0,   ZᵀHZ >= 0 on the null space Z of rows with μᵢ > 0,
+
+with H the Hessian of L = J + μᵀg (Nocedal and Wright, Numerical Optimization, theorems 12.1 and
+12.5). Of rows with μᵢ = 0 theirs holds on a half-space, so that this is no weaker.
 
 g is in shares of a size of each constraint, so that one tolerance serves all.
 """
@@ -132,26 +135,26 @@ class ActiveSet:
     ----------
     gradient : array (n,)
         ∇J.
-    rows, slack, sizes : array (m, n), (m,), (m,)
-        A and the values g, <= 0 where feasible, in shares of the sizes; 1 is the size of a bound.
+    rows, values, sizes : array (m, n), (m,), (m,)
+        A and g, <= 0 where feasible, in shares of the sizes; 1 is the size of a bound.
     labels : tuple of str
     constraints : int
         The number of rows of g; those of bounds follow.
     violation : float
-        max(g, 0) over all constraints and bounds, active or not.
+        max(g, 0) over all constraints and bounds, active or not; NaN where one is unknown.
     """
 
     gradient: Array
     rows: Array
-    slack: Array
+    values: Array
     sizes: Array
     labels: tuple[str, ...]
     constraints: int
     violation: float
 
     @property
-    def size(self) -> float:
-        """The scale ‖∇J‖∞."""
+    def scale(self) -> float:
+        """‖∇J‖∞, by which residuals and curvatures are divided; never 0."""
         return max(float(np.abs(self.gradient).max()), 1e-300)
 
     def multipliers(self) -> Array:
@@ -160,10 +163,10 @@ class ActiveSet:
 
     def residual(self, mu: Array) -> float:
         """Compute ‖∇J + Aᵀμ‖∞/‖∇J‖∞."""
-        return float(np.abs(self.gradient + mu @ self.rows).max()) / self.size
+        return float(np.abs(self.gradient + mu @ self.rows).max()) / self.scale
 
-    def free(self, mu: Array) -> Array:
-        """Z (n, k), an orthonormal basis of the null space of the rows with μ > 0."""
+    def null_space(self, mu: Array) -> Array:
+        """Z (n, k), an orthonormal basis of the directions in which no row with μ > 0 changes."""
         return np.asarray(null_space(self.rows[mu > 0.0]))
 
     def certificate(
@@ -174,7 +177,7 @@ class ActiveSet:
         return KktCertificate(
             stationarity=residual,
             primal=self.violation,
-            complementarity=float(np.abs(mu * self.slack).max(initial=0.0)) / self.size,
+            complementarity=float(np.abs(mu * self.values).max(initial=0.0)) / self.scale,
             multipliers={name: float(value) for name, value in per_unit},
             active=self.labels,
             second_order=second,
@@ -221,30 +224,31 @@ def active_set(
     ActiveSet
     """
     chosen = np.flatnonzero(first.g >= -active)
-    rows, slack, sizes = ([*each[chosen]] for each in (first.jacobian, first.g, first.sizes))
+    rows, values, sizes = ([*each[chosen]] for each in (first.jacobian, first.g, first.sizes))
     labels, count = [first.names[i] for i in chosen], len(chosen)
     for i, name in enumerate(variables):
         for end, value, sign in (("lower", -z[i], -1.0), ("upper", z[i] - 1.0, 1.0)):
             if value >= -active:
                 rows.append(sign * np.eye(z.size)[i])
                 labels.append(f"{name} {end}")
-                slack.append(value)
+                values.append(value)
                 sizes.append(1.0)
-    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *first.g)
+    # NumPy's maximum is NaN where one of them is: an unknown constraint is not a met one.
+    violation = float(np.concatenate([[0.0], -z, z - 1.0, first.g]).max())
     A = np.array(rows).reshape(-1, z.size)
     return ActiveSet(
-        first.gradient, A, np.array(slack), np.array(sizes), tuple(labels), count, violation
+        first.gradient, A, np.array(values), np.array(sizes), tuple(labels), count, violation
     )
 
 
-def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | None:
+def reduced_curvature(Z: Array, columns: Array | None, scale: float) -> float | None:
     """Find the least eigenvalue of the reduced Hessian ZᵀHZ.
 
     Parameters
     ----------
     Z, columns : array (n, k), (n, k) or None
         Z, a basis of the null space of the active constraints, and HZ.
-    size : float
+    scale : float
         ‖∇J‖∞, by which the eigenvalue is divided.
 
     Returns
@@ -256,8 +260,8 @@ def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | N
         return np.inf
     if columns is None or not np.isfinite(columns).all():
         return None
-    H = Z.T @ columns
-    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+    H = Z.T @ columns  # symmetric but for the error of the differences
+    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / scale
 
 
 def hessian_products(
@@ -266,8 +270,10 @@ def hessian_products(
     directions: Array,
     step: float = KktOptions.step,
 ) -> Array | None:
-    """Multiply a Hessian by directions d: (∇J(z + h d) - ∇J(z - h d))/2h, of which a side outside
-    the box is clipped to it.
+    """Multiply a Hessian by directions d: (∇J(z + a d) - ∇J(z - b d))/(a + b).
+
+    a and b are h, or what the box leaves of it along the line, so that the quotient is along d
+    itself beside a bound too: a side that was clipped by itself would turn the line.
 
     Parameters
     ----------
@@ -281,13 +287,18 @@ def hessian_products(
     Returns
     -------
     array (n, k) or None
-        None where a gradient is missing, or clipping leaves points closer than h/2.
+        None where a gradient is missing, or the box leaves less than h/2 of a line.
     """
-    points = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
-    values = [gradient for gradient in gradients(points) if gradient is not None]
-    forward, backward = np.split(points, 2)
-    distance = np.linalg.norm(forward - backward, axis=1)
-    if len(values) < len(points) or (distance < 0.5 * step).any():
+    rays, rounding = np.concatenate([directions.T, -directions.T]), 1e-8 * step
+    with np.errstate(divide="ignore"):  # the larger is the face that the ray runs towards
+        faces = np.maximum((1.0 - z + rounding) / rays, (-z - rounding) / rays)
+    steps = np.clip(faces.min(axis=1), 0.0, step)
+    points = np.clip(z + steps[:, None] * rays, 0.0, 1.0)
+    distance = steps.reshape(2, -1).sum(axis=0)
+    if (distance < 0.5 * step).any():
         return None
-    at_forward, at_backward = np.split(np.array(values), 2)
-    return np.asarray(((at_forward - at_backward) / distance[:, None]).T)
+    values = [gradient for gradient in gradients(points) if gradient is not None]
+    if len(values) < len(points):
+        return None
+    forward, backward = np.split(np.array(values), 2)
+    return np.asarray(((forward - backward) / distance[:, None]).T)

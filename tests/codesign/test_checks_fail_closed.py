@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles.helpers import problem
+from oracles.helpers import HZ, problem
 
-from ccd_casadi.codesign import outer_mixed, outer_structured
+from ccd_casadi.codesign import inner_answer, outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v
+from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
 from ccd_casadi.codesign.outer_problem import FormulationResult, RunTerms
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import result_dict
@@ -26,6 +27,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import certificate
 from ccd_casadi.fixed_structure.bounds import LoopPeaks
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
+from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.sampler import Sampler
@@ -199,3 +201,18 @@ def test_every_range_of_a_survival_is_tried_here() -> None:
         "stable_shift", "S_max_shift", "stable_damping", "gain", "phase_deg", "delay", "modulus",
         "unstable_poles_hz", "statics", "contradiction", "S_max_slack",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("passed", [False, None])
+def test_a_missed_bound_hides_no_unstable_loop(
+    passed: bool | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At given frequencies a bound may be missed; stable the loop has to be."""
+    case = problem(inner=replace(problem().inner, S_max=1.05))
+    how = InnerOptions(0, Workers(1), point=(800.0 * HZ, 40.0 * HZ))
+    answer = mixed_answer(case, (60.0, 60.0), how)
+    assert answer.status == "verified"
+    assert not answer.figures["feasible"]
+    unstable = Judgement(1, {}, passed, "unstable on plant 1 of 1")
+    monkeypatch.setattr(inner_answer, "judge_on_model", lambda *_: unstable)
+    assert mixed_answer(case, (60.0, 60.0), how).status == "not_verified"

@@ -63,7 +63,7 @@ def test_a_range_is_reached_from_the_plant_alone(tmp_path) -> None:  # type: ign
         assert TrueDesign(Sampler(held, store, pool).truth, reached).acceptable
 
 
-@pytest.mark.parametrize("share", [2e-1, 1e-3, 1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("share", [2e-1, 1e-3, 1e-6, 1e-9, 1e-12, 5e-16])
 def test_what_is_missed_never_reads_as_met(share: float) -> None:
     for bound in (2.0, 1.75, 0.03):
         words = missed_by(bound * (1.0 + share), bound)
@@ -84,6 +84,15 @@ def test_a_failed_search_does_not_contradict_itself() -> None:
     assert shown > case.inner.S_max
     assert missed_bounds(case.inner, near)[0].startswith("peak of S")
     assert missed_bounds(case.inner, replace(near, sensitivity_peak=1.2)) == []
+
+
+def test_a_design_of_unknown_figures_is_not_the_nearest() -> None:
+    inner = problem().inner
+    row = true_design(problem(), THETA, 200.0, 200.0).figures
+    beyond = replace(row, sensitivity_peak=1.1 * inner.S_max)
+    unknown = replace(row, sensitivity_peak=np.nan)
+    assert shortfall(inner, [unknown, beyond]) == shortfall(inner, [beyond, unknown])
+    assert "nan" not in shortfall(inner, [unknown, beyond])
 
 
 def test_the_words_say_what_was_tried_where_and_what_next() -> None:

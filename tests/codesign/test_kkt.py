@@ -13,7 +13,13 @@ from ccd_casadi.codesign.outer_problem import OuterSolution, outer_program, solv
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.optim.kkt import KktCertificate
+from ccd_casadi.optim.kkt import (
+    FirstOrder,
+    KktCertificate,
+    KktOptions,
+    active_set,
+    hessian_products,
+)
 
 
 def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:
@@ -108,3 +114,35 @@ def test_residuals_grow_with_the_distance_from_the_optimum(change: float) -> Non
     assert max(inside.primal, outside.primal) == pytest.approx(
         abs(change * quantities.jacobian_at(solution.best.x)[1, 3]), rel=0.1
     )
+
+
+@few(max_examples=60)
+@given(st.tuples(*3 * [st.sampled_from([0.0, 3e-7, 5e-5, 0.5, 1.0])]), st.integers(0))
+def test_curvature_beside_a_bound_is_along_the_direction_itself(z: tuple, seed: int) -> None:
+    """Of a quadratic function differences are exact, of whatever length."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(3, 3))
+    H, d = root @ root.T, np.linalg.qr(random.normal(size=(3, 1)))[0]
+
+    def gradients(points: np.ndarray) -> list[np.ndarray]:
+        np.testing.assert_array_equal(points, np.clip(points, 0.0, 1.0))
+        return [H @ point for point in points]
+
+    found = hessian_products(gradients, np.array(z), d)
+    if found is not None:  # measured: 3e-8
+        np.testing.assert_allclose(found, H @ d, atol=1e-6 * np.abs(H).max())
+    bounded = sum(value in (0.0, 3e-7, 1.0) for value in z)
+    assert found is not None or bounded > 1  # one bound leaves the other side
+
+
+def test_directions_along_a_bound_that_rounding_lets_off_it_have_both_sides() -> None:
+    d = np.array([[1e-17], [1.0]])
+    seen: list[np.ndarray] = []
+    hessian_products(lambda points: seen.extend(points) or list(points), np.array([0.0, 0.5]), d)
+    assert np.ptp([point[1] for point in seen]) == pytest.approx(2.0 * KktOptions.step)
+
+
+def test_a_constraint_that_is_not_known_is_not_met() -> None:
+    g, one = np.array([np.nan, -1.0]), np.ones(2)
+    first = FirstOrder(one, g, np.ones((2, 2)), one, ("a", "b"))
+    assert np.isnan(active_set(np.array([0.5, 0.5]), first, ("x", "y")).violation)

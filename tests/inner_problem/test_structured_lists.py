@@ -144,7 +144,7 @@ def test_as_many_places_may_be_chosen_as_the_constraint_allows(
     problem = restrict(
         problem_of(load_case(tmp_path / "case.toml")), {"a": (float(a),), "b": (float(b),)}
     )
-    found = structured_lists._nearest_allowed(problem, np.array([1.9]))
+    found = structured_lists.nearest_allowed(problem, np.array([1.9]))
     assert (found is not None) == kept
     if found is not None:
         assert found[0] == pytest.approx(1.5, abs=1e-6)

@@ -42,7 +42,7 @@ from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.machine import find_lumped, lumped_svg
 from ccd_casadi.reporting.nyquist import loop_panels
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, use_units
 from ccd_casadi.synthesis.synthesis import Outcome
 
 CASE = Path("runs/two_mass.toml")
@@ -259,6 +259,16 @@ def test_every_panel_can_be_painted_marks_with_words_alone_too(session, searched
                 if "data" in values]  # fmt: skip
         words = [word for data in sent for word in data.get("text", ())]
         assert {mark.text for mark in panel.marks} - {""} <= set(words)
+
+
+def test_the_error_of_a_move_is_drawn_in_the_unit_of_the_plant(searched_look) -> None:
+    curves = curves_of(searched_look)
+    use_units("rad", "N m")
+    try:
+        panel = draw_design(searched_look, curves, None).panels["move"]
+    finally:
+        use_units("m", "N")
+    assert panel.y_label == "error (µrad)"
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

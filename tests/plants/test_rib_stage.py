@@ -281,6 +281,15 @@ def test_z_alone_has_the_modes_that_it_moves_and_is_that_channel() -> None:
         RibStage(geometry=heavy, order=COARSE, outputs="z").mechanics(B)
 
 
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [((), "give one point or more"), (((np.nan, 0.0), (0.1, 0.1), (0.1, 0.0)), "off the stage")],
+)
+def test_points_that_are_none_are_refused(points: tuple, words: str) -> None:
+    with pytest.raises(StageError, match=words):
+        RibStage(sensors=points)
+
+
 def test_signs_hold_along_a_path() -> None:
     stage = RibStage(order=COARSE)
     path = [stage.mechanics(theta, derivatives=False).B for theta in np.linspace(A, B, 7)]

@@ -10,6 +10,7 @@ from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 from oracles.measured_files import measured
 from scipy.io import savemat
 
+from ccd_casadi.extensions.measured.between_lines import bound_between_lines
 from ccd_casadi.extensions.measured.line_problem import line_problem
 from ccd_casadi.extensions.measured.measured_design import design_on_data
 from ccd_casadi.extensions.measured.measured_loop import judge, winding
@@ -239,3 +240,20 @@ def test_what_repeated_measurements_leave_open_is_in_the_bound_on_S(tmp_path) ->
     assert np.array_equal(read_frequency_response(tmp_path / "two.npz").spread, spread)
     with pytest.raises(UserError, match="spread"):
         MeasuredResponse(hz, G, spread=spread[:5])
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_a_line_that_the_controller_blocks_is_no_error_of_the_bound(channels: int) -> None:
+    """L has no inverse there: by L alone the bound is the larger, and the same elsewhere."""
+    hz = np.geomspace(1.0, 100.0, 40)
+    s = 1j * hz[:, None, None]
+    G = np.eye(channels) / s**2 + 0.1 * np.ones((channels, channels)) / (s + 30.0)
+    lines = MeasuredResponse(hz, G if channels > 1 else G[:, 0, 0])
+    K = np.broadcast_to(20.0 * np.eye(channels) + 0j, G.shape)
+    blocking = K.copy()
+    blocking[20, 0] = 0.0
+    whole, blocked = (bound_between_lines(lines, G @ each, each) for each in (K, blocking))
+    far = np.abs(np.arange(39) - 19.5) > 3.0  # second differences reach two lines further
+    np.testing.assert_allclose(blocked[far], whole[far], rtol=1e-9)
+    S = np.linalg.norm(np.linalg.inv(np.eye(channels) + G @ blocking), 2, axis=(1, 2))
+    assert (blocked >= (1.0 - 1e-9) * np.maximum(S[1:], S[:-1])).all()

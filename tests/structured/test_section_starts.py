@@ -15,9 +15,9 @@ from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.multi_start import (
     MultiStartOptions,
     at_its_bandwidth,
-    distinct,
     reinsert,
     search_from_starts,
+    select_distinct,
     start_at,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redraw_section, stabilising
@@ -69,12 +69,12 @@ def test_what_is_redrawn_never_loses_what_was_found() -> None:
     rng = np.random.default_rng(1)
     pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
     first = search_from_starts(problem, pool, lambda words: None)
-    ends = [end.kappa for end in distinct(first, 2)]
+    ends = [end.kappa for end in select_distinct(first, 2)]
     fresh = stabilising(problem, redraw_section(problem, ends, 24, rng))[:3]
     again = search_from_starts(problem, fresh, lambda words: None, before=first)
     assert again[0].merit >= first[0].merit
     assert not any(runner.running for runner in again)
-    kept = distinct(again, 5)
+    kept = select_distinct(again, 5)
     assert len(kept) == len({tuple(end.kappa) for end in kept})
 
 
@@ -126,7 +126,7 @@ def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
     """
     problem = problem_for([plant()], Structure(lead=1, biquads=0), EASY)
     pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))
-    (one, *_) = distinct(search_from_starts(problem, pool, lambda words: None), 1)
+    (one, *_) = select_distinct(search_from_starts(problem, pool, lambda words: None), 1)
     more = problem_for([plant()], Structure(lead=2, biquads=0), EASY)
     kappa = np.insert(one.kappa, 4, np.full(2, more.box[0, 1]))
     end = at_its_bandwidth(more, kappa)

@@ -1,4 +1,4 @@
-"""What is drawn and said of one design."""
+"""What is drawn and said of one design: the curves of its loop, words, and a panel a figure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,22 +30,31 @@ from ccd_casadi.reporting.gain_figures import gain_panels
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import loci_of, loop_panels, nyquist_panel, size_panels
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.text import HZ, number, template, with_unit
+from ccd_casadi.support.text import HZ, number, spoken, template, with_unit
 
 POINTS = 180  # of the frequency grid, besides those around resonances
 STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
 WATCHED = 2.0  # durations of the move that are shown
-NONE = np.zeros(0)
-AT_REST = Move(NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, LIMITS.window)
+SAME_PEAK = 1e-3  # relative: two values of one peak of S
+NO_TIME = np.zeros(0)
+AT_REST = Move(NO_TIME, NO_TIME, NO_TIME, np.zeros((0, 1)), False, 0.0, LIMITS.window)
 
 
 @dataclass(frozen=True)
 class Curves:
     """The curves of one design: its loop on the plant that is shown, over frequency and over time.
 
-    `step`: y of the first output (s) after a step of its reference. An unstable loop has no step
-    and no move (`AT_REST`).
+    Attributes
+    ----------
+    view : LoopView
+        Responses of the loop.
+    step_time, step : array (N,)
+        s, and the first output after a unit step of its reference.
+    move : Move
+        Of the first output, with feedforward.
+
+    An unstable loop has no step and no move (`AT_REST`).
     """
 
     view: LoopView
@@ -62,11 +71,11 @@ class Curves:
     @property
     def unstable(self) -> bool:
         """Whether the loop is unstable: it has no step, no move and no margins."""
-        return not self.poles[2].real.max() < 0.0
+        return not self.view.loop.stable
 
     @property
     def unstable_controller_hz(self) -> list[float]:
-        """Unstable poles of K by itself, a pair once, ascending."""
+        """|p| of the unstable poles p of K by itself, a pair once, ascending."""
         K = self.poles[1]
         return sorted(np.abs(K[(K.real > 1e-9 * np.abs(K)) & (K.imag >= 0.0)]).tolist())
 
@@ -96,19 +105,20 @@ def curves_of(design: ExploredDesign) -> Curves | None:
     bounded = kind_of(problem).gain_bounds(design.weights, gamma, design.bandwidth_hz)
     f = design.figures
     top, at = f.sensitivity_peak, f.sensitivity_peak_frequency
-    own = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
-    peaks = ((at / HZ, top),) if abs(own / top - 1.0) < 1e-3 else None  # else another plant's
+    # The peak is the largest of the set: it is marked where it is of the plant that is drawn.
+    here = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
+    peaks = ((at / HZ, top),) if abs(here / top - 1.0) < SAME_PEAK else None
     view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=peaks)
-    time, step, move = NONE, NONE, AT_REST
+    time, step, move = NO_TIME, NO_TIME, AT_REST
     if loop.stable:
         first = np.eye(loop.closed.B_r.shape[1])[0]
         time, y = step_response(loop, first, STEP_PERIODS / bandwidth, STEP_POINTS)
-        step, move = y[:, 0], _move(design, loop, bandwidth)
+        step, move = y[:, 0], _compute_move(design, loop, bandwidth)
     return Curves(view, time, step, move)
 
 
-def _move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
-    """The move of [move], else the default one of robustness."""
+def _compute_move(design: ExploredDesign, loop: Loop, bandwidth_hz: float) -> Move:
+    """The move of [move], else the default one of robustness, of the first output."""
     profile, window = setpoint(LIMITS), LIMITS.window
     ahead = feedforward_of(loop, 0)
     if design.problem.source.motion is not None:
@@ -130,7 +140,7 @@ def sampled_of(design: ExploredDesign) -> AsSampled | None:
 
 
 def with_sampled(design: ExploredDesign, found: AsSampled | None) -> ExploredDesign:
-    """The look with the standing that its sampled loop leaves it."""
+    """The design with the standing that its sampled loop leaves it."""
     k, S_max = design.knobs, design.problem.inner.S_max
     if found is None or (found.stable and found.peak <= S_max):
         return design
@@ -146,7 +156,7 @@ def with_sampled(design: ExploredDesign, found: AsSampled | None) -> ExploredDes
 def as_sampled(
     plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float
 ) -> AsSampled:
-    """A controller in discrete time on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
+    """A controller by Tustin's rule on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
     loop = Loop(plant.plant_si(), controller, Sampling(rate_hz, delay_us))
     f = sampled_figures(loop.closed.S)
     near = plant.grid * plant.omega_0 / HZ
@@ -258,19 +268,19 @@ def draw_design(
     loci = list(loci_of(view.open[0]).T)
     panels |= {
         "nyquist": nyquist_panel(view.hz, loci, view.bounded.S_max, others=BLUE),
-        "poles": _poles(c),
-        "step": _over_time(c.step_time, c.step, "y after a step of r", Level(1.0, "")),
-        "move": _over_time(c.move.time, 1e6 * c.move.error, "error (µm)",
-                           Level(1e3 * c.move.duration, "end of the move", True)),
+        "poles": _draw_poles(c),
+        "step": _draw_over_time(c.step_time, c.step, "y after a step of r", Level(1.0, "")),
+        "move": _draw_over_time(c.move.time, 1e6 * c.move.error, spoken("error (µm)"),
+                                Level(1e3 * c.move.duration, "end of the move", True)),
     }  # fmt: skip
     return Drawn(design, panels if notched is None else notched.on(panels))
 
 
-def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:
+def _draw_over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:
     return Panel("time (ms)", label, (Curve(1e3 * time, values),), levels=(level,))
 
 
-def _poles(c: Curves) -> Panel:
+def _draw_poles(c: Curves) -> Panel:
     """Draw the poles of the plant, of K and of the loop: frequency and damping."""
     curves = []
     drawn_designs = (("plant", GREY, "o"), ("controller", GREEN, "^"), ("closed loop", BLUE, "x"))

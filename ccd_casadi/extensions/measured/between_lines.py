@@ -4,15 +4,17 @@ Between two lines L = GK is taken to lie within r of the chord,
 
     r = 2 h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
 
-twice the error of linear interpolation, where L bends between two lines as around them. A
-resonance that fits between two lines is not seen. Where measurements were repeated, their spread
-Δ adds ‖Δ |K|‖ to r at the lines. With it σ_max(S) <= 1/(least σ_min(I + L) on the
-chord less r); where L is large the same of L⁻¹ = (GK)⁻¹, which is nearly straight there.
+twice the error of linear interpolation over h = Δ ln f, where L bends between two lines as around
+them. A resonance that fits between two lines is not seen. Where measurements were repeated, their
+spread Δ adds ‖Δ |K|‖ to r at the lines. σ_min is 1-Lipschitz, so that
+σ_max(S) = 1/σ_min(I + L) <= 1/(least σ_min(I + L) on the chord - r); where L is large the same of
+L⁻¹ = (GK)⁻¹, which is nearly straight there.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.plants.measured import MeasuredResponse
@@ -26,8 +28,8 @@ class InterpolationErrorOptions:
     safety: float = 2.0  # factor on the error of linear interpolation
     deviations: float = 3.0  # standard deviations up to which a second difference may be noise
     strides: tuple[int, ...] = (2, 4, 8)  # lines, over which it is then taken
-    window: int = 15  # lines, over which the noise is estimated
-    places: int = 9  # on a chord
+    window: int = 15  # lines, over which the noise is estimated; odd
+    places: int = 9  # on a chord, of several channels
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,9 @@ def interpolation_errors(
 ) -> Array:
     """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f.
 
-    Where those of neighbouring lines do not stand out of the noise, of lines further apart.
+    A second difference 1, -2, 1 of values with noise σ has the deviation √(1 + 4 + 1) σ, whatever
+    h: L'' = difference/h² is the surer the further its lines are apart. So where that of neighbours
+    does not exceed its noise, those over `strides` count, with their noise added.
     """
     x = np.log(hz)
     noise = options.deviations * np.sqrt(6.0) * _noise(x, L, options.window)
@@ -55,9 +59,8 @@ def interpolation_errors(
         if len(x) > 2 * stride and noise.max() > 0.0:
             wide = _curvature(x, L, stride) + noise / _half_width(x, stride) ** 2
             around = np.where(around * step**2 < noise, np.minimum(around, wide), around)
-    wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
-    each = np.maximum(around, wider)
-    return np.asarray(options.safety * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
+    largest = sliding_window_view(np.pad(around, 1), 4).max(axis=1)
+    return np.asarray(options.safety * np.diff(x) ** 2 / 8.0 * largest)
 
 
 def _curvature(x: Array, L: np.ndarray, stride: int) -> Array:
@@ -70,84 +73,99 @@ def _curvature(x: Array, L: np.ndarray, stride: int) -> Array:
 
 
 def _half_width(x: Array, stride: int) -> Array:
+    """h (k,) of the second difference at each line, the mean of its two steps in ln f."""
     return np.pad(0.5 * (x[2 * stride :] - x[: -2 * stride]), stride, mode="edge")
 
 
 def _noise(x: Array, L: np.ndarray, window: int) -> Array:
-    """Standard deviation of the noise of L at each line (k,): its distance from the cubic through
-    the two lines on each side, the median of those around."""
+    """Standard deviation of the noise of L at each line (k,), the median over a `window` of lines.
+
+    One estimate is the distance of L from the cubic through the two lines on each side: with
+    Lagrange's weights w that is ε - Σ w_i ε_i, of the deviation √(1 + Σ w_i²) σ. Too few lines
+    count as free of noise.
+    """
     if len(x) < window:
         return np.zeros(len(x))
-    at, near = x[2:-2], [x[:-4], x[1:-3], x[3:-1], x[4:]]
-    off = L[2:-2] + 0.0
-    spread = np.ones(len(at))
-    for i, own in enumerate((L[:-4], L[1:-3], L[3:-1], L[4:])):
-        weight = np.prod([(at - other) / (near[i] - other)
-                          for j, other in enumerate(near) if j != i], axis=0)  # fmt: skip
-        off = off - weight[:, None, None] * own
-        spread += weight**2
-    size = np.pad(sigma_max(off) / np.sqrt(spread), 2, mode="edge")
-    half = window // 2
-    return np.median(np.lib.stride_tricks.sliding_window_view(
-        np.pad(size, half, mode="reflect"), window), axis=1)  # fmt: skip
+    inner, neighbours = slice(2, -2), (slice(-4), slice(1, -3), slice(3, -1), slice(4, None))
+    distance, variance = L[inner].copy(), np.ones(len(x) - 4)
+    for own in neighbours:
+        weight = np.prod([(x[inner] - x[other]) / (x[own] - x[other])
+                          for other in neighbours if other != own], axis=0)  # fmt: skip
+        distance -= weight[:, None, None] * L[own]
+        variance += weight**2
+    deviation = np.pad(sigma_max(distance) / np.sqrt(variance), 2, mode="edge")
+    padded = np.pad(deviation, window // 2, mode="reflect")
+    return np.median(sliding_window_view(padded, window), axis=1)
 
 
 def hidden_damping(
-    measured: MeasuredResponse, L: np.ndarray, k: np.ndarray,
+    measured: MeasuredResponse, L: np.ndarray, K: np.ndarray,
     options: HiddenResonanceOptions = HiddenResonanceOptions(),
 ) -> Array:  # fmt: skip
     """The largest damping ratio with which a resonance between neighbouring lines (k - 1,) may make
     I + L singular and yet not show on them.
 
-    It has to be H = σ_min(I + L)/σ_max(K) high at least, and on the lines around it is then
-    q/(t - t₀) with q = H ζ/h, t counted in their distance h in ln f. G, its slope removed, leaves
-    room for a q beside what it does else, by the smaller of two estimates. Where lines are closer
-    than its width 2 ζ a resonance is not hidden either.
+    To make I + L singular it has to be H = σ_min(I + L)/σ_max(K) high at least. Beyond its width
+    H/(1 + j(ω/ω₀ - ω₀/ω)/(2ζ)) is H ζ/(j ln(ω/ω₀)), on the lines around so q/(t - t₀) with
+    q = H ζ/h but for its phase, t counted in their distance h in ln f. G, its slope removed, leaves
+    room for a q beside what it does else, by the smaller of two estimates:
+
+    - The step of q/(t - t₀) over the pair that t₀ lies between is q/t₀ + q/(1 - t₀) >= 4 q, and
+      those of the pairs beside it have the other sign. So q is at most a quarter of what the step
+      of G differs from those beside it, here or up to two pairs away.
+    - What a fit with another pole leaves, `_room_beside_a_pole`.
+
+    Where lines are closer than its width 2 ζ a resonance is not hidden either.
     """
     x = np.log(measured.hz)
     h, flat = np.diff(x), (measured.hz / measured.hz[0]) ** measured.slope
     G = measured.matrix * flat[:, None, None]
     slope = np.diff(G, axis=0) / h[:, None, None]
-    around = 0.5 * (np.concatenate([slope[1:2], slope[:-1]])
-                    + np.concatenate([slope[1:], slope[-2:-1]]))  # fmt: skip
-    jump = np.pad(sigma_max(slope - around) * h, 2, mode="edge")
-    room = np.lib.stride_tricks.sliding_window_view(jump, 5).max(axis=1) / 4.0
+    beside = np.pad(slope, ((1, 1), (0, 0), (0, 0)), mode="reflect")
+    jump = np.pad(sigma_max(slope - 0.5 * (beside[:-2] + beside[2:])) * h, 2, mode="edge")
+    room = sliding_window_view(jump, 5).max(axis=1) / 4.0
     room = np.minimum(room, _room_beside_a_pole(x, G.reshape(len(x), -1), options))
     eye, middle = np.eye(L.shape[1]), 0.5 * (L[1:] + L[:-1])
     ends, centre = (np.linalg.norm(eye + part, -2, axis=(1, 2)) for part in (L, middle))
-    height = flat / sigma_max(k)
+    height = flat / sigma_max(K)  # of H per σ_min(I + L), in the units of the flattened G
     height = np.minimum(height[1:], height[:-1])
-    needed = np.minimum(centre, np.minimum(ends[1:], ends[:-1])) * height
-    return np.minimum(h * room / needed, 0.5 * h)
+    H = np.minimum(centre, np.minimum(ends[1:], ends[:-1])) * height
+    return np.minimum(h * room / H, 0.5 * h)
 
 
 def _room_beside_a_pole(x: Array, G: np.ndarray, options: HiddenResonanceOptions) -> Array:
     """The largest q between neighbouring lines (k - 1,) of x, if G (k, entries) is else a parabola
-    over one pole on the lines around: how well that fits them over how badly it fits 1/(t - t₀).
-    Infinite where that pole is itself a resonance narrower than the lines."""
+    over one pole on the lines around.
+
+    Each entry g = (a + b t + c t²)/(1 + d t) is linear in a, b, c and d, and is fitted by least
+    squares: g = a + b t + c t² - d t g. A resonance beside it adds q (1 + d t)/(t - t₀), which the
+    basis cannot follow. So q is at most the residual of g over that of (1 + d t)/(t - t₀), times
+    `safety`. Infinite where the fitted pole t = -1/d is itself a resonance narrower than the lines.
+    """
     fitted, near = options.fitted, options.near
     if len(x) < fitted:
         return np.full(len(x) - 1, np.inf)
     every = np.arange(len(x) - 1)
     lines = np.clip(every - fitted // 2 + 1, 0, len(x) - fitted)[:, None] + np.arange(fitted)
+    # t counts from the middle of the pair: its lines are at -1/2 and 1/2
     t = (x[lines] - 0.5 * (x[1:] + x[:-1])[:, None]) / np.diff(x)[:, None]
-    room, inside = np.zeros(len(every)), np.linspace(-0.4, 0.4, options.places)
+    squares, inside = np.zeros(len(every)), np.linspace(-0.4, 0.4, options.places)
     for own in G.T:
         g = own[lines]
         basis = np.stack([t**0, t, t**2, -t * g], axis=-1)
         Q = np.linalg.qr(basis).Q
 
-        def beside(v: np.ndarray, Q: np.ndarray = Q) -> np.ndarray:
-            return np.asarray(v - (Q @ (Q.conj().swapaxes(1, 2) @ v[..., None]))[..., 0])
+        def residual(v: np.ndarray, Q: np.ndarray = Q) -> Array:
+            off = v - (Q @ (Q.conj().swapaxes(1, 2) @ v[..., None]))[..., 0]
+            return np.linalg.norm(off, axis=1)
 
-        pole = (np.linalg.pinv(basis) @ g[..., None])[:, 3]
-        left = np.linalg.norm(beside(g), axis=1)
-        tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in inside]
-        room += (options.safety * left / np.min(tails, axis=0)) ** 2
+        d = (np.linalg.pinv(basis) @ g[..., None])[:, 3]
+        least = np.min([residual((1.0 + d * t) / (t - t0)) for t0 in inside], axis=0)
+        squares += (options.safety * residual(g) / least) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
-            at = -1.0 / pole[:, 0]
-        room[(np.abs(at.real) < near) & (np.abs(at.imag) < near)] = np.inf
-    return np.sqrt(room)
+            pole = -1.0 / d[:, 0]
+        squares[(np.abs(pole.real) < near) & (np.abs(pole.imag) < near)] = np.inf
+    return np.sqrt(squares)
 
 
 def gap_of(hz: Array, i: int) -> str:
@@ -155,15 +173,15 @@ def gap_of(hz: Array, i: int) -> str:
     return f"between {hz[i]:.4g} and {hz[i + 1]:.4g} Hz"
 
 
-def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
+def bound_between_lines(measured: MeasuredResponse, L: np.ndarray, K: np.ndarray) -> Array:
     """Bound σ_max(S) between neighbouring lines.
 
-    By L, or where it is large and its inverse the smoother by S = L⁻¹ (I + L⁻¹)⁻¹.
-    L = GK at each line is known within u = ‖Δ |K|‖, so L⁻¹ within ‖L⁻¹‖²u/(1 - ‖L⁻¹‖u).
+    By L, or where it is large and its inverse the smoother by S = L⁻¹ (I + L⁻¹)⁻¹. L = GK at each
+    line is known within u = ‖Δ |K|‖, so L⁻¹ within ‖L⁻¹‖²u/(1 - ‖L⁻¹‖u), by Neumann's series.
 
     Parameters
     ----------
-    measured, L, k : MeasuredResponse, array (k, p, p), array (k, m, p)
+    measured, L, K : MeasuredResponse, array (k, p, p), array (k, m, p)
         GK and K on its lines.
 
     Returns
@@ -171,18 +189,23 @@ def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     array (k - 1,)
         Infinite where I + L may be singular.
     """
-    hz, over, unsure = measured.hz, np.linalg.inv(L), np.zeros(len(L))
+    hz, unsure = measured.hz, np.zeros(len(L))
     if measured.spread is not None:
-        unsure = sigma_max(measured.spread.reshape(measured.matrix.shape) @ np.abs(k))
-    far = sigma_max(over) * unsure
+        unsure = sigma_max(measured.spread.reshape(measured.matrix.shape) @ np.abs(K))
+    # Where L is singular, as where K blocks a channel, its inverse is out of all proportion.
+    singular = np.linalg.det(L)[:, None, None] == 0.0
+    inverse = np.linalg.inv(np.where(singular, 1e-100 * np.eye(L.shape[1]), L))
+    size = sigma_max(inverse)
+    far = size * unsure
     with np.errstate(divide="ignore"):
-        of_inverse = np.where(far < 1.0, sigma_max(over) * far / np.maximum(1.0 - far, 0.0), np.inf)
-    direct, inverse = _clearances(hz, L, unsure), _clearances(hz, over, of_inverse)
-    size = sigma_max(over) + of_inverse
-    size = np.maximum(size[1:], size[:-1]) + interpolation_errors(hz, over)
+        unsure_inverse = np.where(far < 1.0, size * far / np.maximum(1.0 - far, 0.0), np.inf)
+    direct = _clearances(hz, L, unsure)
+    of_inverse = _clearances(hz, inverse, unsure_inverse)
+    size = size + unsure_inverse
+    size = np.maximum(size[1:], size[:-1]) + interpolation_errors(hz, inverse)
     with np.errstate(divide="ignore"):
         by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
-        by_inverse = np.where(inverse > 0.0, size / np.maximum(inverse, 0.0), np.inf)
+        by_inverse = np.where(of_inverse > 0.0, size / np.maximum(of_inverse, 0.0), np.inf)
     return np.minimum(by_L, by_inverse)
 
 
@@ -194,14 +217,15 @@ def _clearances(
 ) -> Array:
     """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r and `unsure`.
 
-    Of several channels that at a place near by, less half the step to the next.
+    Of one channel the distance of -1 from the chord. Of several the least at places on it, less
+    half the step from one to the next, since σ_min changes by no more than L.
     """
     step = np.diff(L, axis=0)
     if L.shape[1] == 1:
         start, along = 1.0 + L[:-1, 0, 0], step[:, 0, 0]
-        size = np.abs(along) ** 2
-        share = np.clip(-(start * along.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
-        least = np.abs(start + share * along)
+        length = np.abs(along) ** 2
+        share = -(start * along.conj()).real / np.where(length == 0.0, 1.0, length)
+        least = np.abs(start + np.clip(share, 0.0, 1.0) * along)
     else:
         shares = np.linspace(0.0, 1.0, options.places)
         places = np.eye(L.shape[1]) + L[:-1] + shares[:, None, None, None] * step

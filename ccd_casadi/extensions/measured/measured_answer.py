@@ -13,7 +13,7 @@ from ccd_casadi.codesign.inner_answer import InnerAnswer
 from ccd_casadi.codesign.structured_entries import sections_controller
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.extensions.measured.between_lines import between
+from ccd_casadi.extensions.measured.between_lines import bound_between_lines
 from ccd_casadi.extensions.measured.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.extensions.measured.measured_loop import controller_response
 from ccd_casadi.inner_problem.sections_words import sections_dict
@@ -161,7 +161,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         joint = one.matrix @ K
         S = sensitivity(joint)
         if not one.modelled:  # of a model ‖S‖∞ is known
-            reach = between(one, joint, K)  # drawn at the middle of two lines
+            reach = bound_between_lines(one, joint, K)  # drawn at the middle of two lines
             curves["at most"].append(c.Curve(np.sqrt(hz[1:] * hz[:-1]),
                                            np.where(reach < np.inf, reach, np.nan),
                                            "between lines, at most", GREY, width=0.9))  # fmt: skip

@@ -24,7 +24,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, Decou
 from ccd_casadi.fixed_structure.design import DesignOptions, in_problem_units
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
-from ccd_casadi.fixed_structure.multi_start import finish, search_from_starts
+from ccd_casadi.fixed_structure.multi_start import search_from_starts, select_ends
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
@@ -138,7 +138,7 @@ def design_on_data(
         words = NO_START if all(one.modelled for one in responses) else NO_START + OF_DATA
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, words, spent, sign)
     best: MeasuredDesign | None = None
-    for runner in finish(search_from_starts(problem, np.array(pool), progress, workers)):
+    for runner in select_ends(search_from_starts(problem, np.array(pool), progress, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
         spent += runner.evaluations + end.evaluations
         kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa

@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ccd_casadi.extensions.measured.between_lines import between, gap_of, hidden_damping
+from ccd_casadi.extensions.measured.between_lines import bound_between_lines, gap_of, hidden_damping
 from ccd_casadi.fixed_structure.bounds import Bounds, LoopPeaks, ShapeEnd
 from ccd_casadi.kernels.sections import HALF_POWER
 from ccd_casadi.lti.loop import tustin
@@ -94,7 +94,7 @@ def judge(
     joint = whole.G @ k
     Z, doubts = winding(measured, joint, int(integrator))
     first = len(whole.hz) - len(hz)
-    reach = between(measured, joint[first:], k[first:])
+    reach = bound_between_lines(measured, joint[first:], k[first:])
     if not measured.modelled and not np.isfinite(reach).all():
         pairs = np.flatnonzero(np.isinf(reach))
         doubts.append(f"between {len(pairs)} pairs of lines GK may pass -1, the first "

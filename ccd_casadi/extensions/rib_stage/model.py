@@ -61,14 +61,14 @@ FORTY_FOUR = ModeCount(A1=8, B1=6, B2=8, A2=6, tilt=8)
 
 @dataclass(frozen=True)
 class Mode:
-    """The origin of a column of the model: group, place in it, image; frequency in Hz."""
+    """The origin of a column of the model; group, place and image are -1 of a rigid-body mode."""
 
     name: str  # symmetry: z, tip, tilt, A1, B1, B2, A2, SA, AS, or "-" without symmetry
-    sector: str  # SS, SA, AS, AA, or "-"
-    frequency: float
-    group: int = -1
-    place: int = -1
-    image: int = -1
+    sector: str  # of the quarter that is solved, S or A about x and y: SS, SA, AS, AA, or "-"
+    frequency: float  # Hz
+    group: int = -1  # of symmetries that are solved together, its number in ModeSet.spectra
+    place: int = -1  # among the modes of that group, the lowest is 0
+    image: int = -1  # of the symmetries that one solution stands for, as SA and AS of a square
 
 
 @dataclass(frozen=True)
@@ -84,15 +84,17 @@ class ModeSet:
 
 
 def fade(values: Array, slopes: Array, full: int) -> tuple[Array, Array]:
-    """Fade the displacements of the modes of a group, and their slopes (θ, k), towards the last
-    one.
+    """Compute the weights w (k,) of the displacements of a group's modes, and their slopes (θ, k).
 
     `values` (k + 1,) and `slopes` (θ, k + 1) are λ of k modes that are kept and of the next one, b;
-    the first `full` count whole, a being the last of these, the others by
+    the first `full` count whole, a being the last of these, the others by Hermite's step
 
-        w = t²(3 - 2t),   t = (λ_b - λ)/(λ_b - λ_a).
+        w = t²(3 - 2t),   t = (λ_b - λ)/(λ_b - λ_a),   w' = 6t(1 - t) t',
+        t' = (λ_b' - λ' - t (λ_b' - λ_a'))/(λ_b - λ_a).
 
-    Modes that nearly meet change places: w is one where a does with the next, and zero at b.
+    A mode without displacements is neither driven nor seen, so that the plant has lost it. Where
+    two modes nearly meet they change places in the order of λ, and the plant does not jump: w = 1
+    on both sides where a and the next one do, w = 0 where b and the one before it do.
     """
     a, b = full - 1, len(values) - 1
     span, slope = values[b] - values[a], (slopes[:, b] - slopes[:, a])[:, None]
@@ -114,8 +116,8 @@ def solve_modes(
 
     By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, or the even and the odd ones
     about an axis, lowest first in each: it does not change where frequencies of different
-    symmetries cross. So many `fading` ones of every group follow. With `points` they have slopes of
-    displacements there, made beside their factorisations: all of these at once are large.
+    symmetries cross. The `fading` ones of every group follow. With `points` they have slopes of
+    displacements there, computed while a group's factorisation is in memory: all at once are large.
     """
     square = has_square_symmetry(geometry)
     wanted = {}
@@ -139,9 +141,9 @@ def solve_modes(
     spectra = tuple(found[group] for group in wanted)
     flexible = [
         _mode(item, index, place, image)
-        for first in (True, False)
+        for whole in (True, False)  # then those that fade
         for index, (item, number) in enumerate(zip(spectra, wanted.values(), strict=True))
-        for place in (range(number) if first else range(number, number + fading))
+        for place in (range(number) if whole else range(number, number + fading))
         for image in range(len(item.group.images))
     ]
     if by_frequency:
@@ -193,8 +195,11 @@ class RibStage:
             raise StageError(f"truncation is {self.truncation!r}; give symmetry or frequency")
         if self.fading and (has_square_symmetry(self.geometry) or self.truncation != "symmetry"):
             raise StageError("fading is for point masses that break the square; leave it out")
+        half = 0.5 * self.geometry.side * (1 + 1e-12)
         for points in (self.actuator_points, self.sensor_points):
-            if max(abs(v) for p in points for v in p) > 0.5 * self.geometry.side * (1 + 1e-12):
+            if not points:
+                raise StageError("the stage has no actuator or no sensor; give one point or more")
+            if not all(abs(v) <= half for p in points for v in p):
                 raise StageError("an actuator or a sensor is off the stage; move it inside")
             if self.outputs == "modal4" and len(points) != 4:
                 raise StageError("modal4 needs four actuators and four sensors")
@@ -235,20 +240,20 @@ class RibStage:
 def orthonormal_directions(points: Sequence[Point], count: int) -> Array:
     """(count, points): z, tip, tilt as orthonormal rows, fourth what is left of four points.
 
-    Gram-Schmidt of 1, y, x at the points, in this order; at the corners of a square the rows
+    Rigid motions move a point (x, y) by 1, y and x. Gram-Schmidt of these at the points and of xy,
+    in this order, by QR, each with the sign of its function; at the corners of a square the rows
     are (1, 1, 1, 1)/2, (1, 1, -1, -1)/2, (1, -1, -1, 1)/2 and (1, -1, 1, -1)/2.
 
     >>> orthonormal_directions(((1, 1), (-1, 1), (-1, -1), (1, -1)), 4)[3].round(6).tolist()
     [0.5, -0.5, 0.5, -0.5]
     """
     x, y = np.array(points, float).T
-    columns = np.stack([np.ones_like(x), y, x], axis=1)
-    if len(points) < 3 or np.linalg.matrix_rank(columns) < 3:
+    functions = np.stack([np.ones_like(x), y, x, x * y])
+    if len(points) < 3 or np.linalg.matrix_rank(functions[:3]) < 3:
         raise StageError("actuators and sensors must not lie on one line; move one")
-    full = np.linalg.qr(np.hstack([columns, (x * y)[:, None]]), mode="complete")[0]
-    rows = full.T[:count]
-    wanted = np.vstack([columns.T, x * y])[:count]
-    return rows * np.where(np.einsum("ij,ij->i", rows, wanted) < 0.0, -1.0, 1.0)[:, None]
+    rows = np.linalg.qr(functions.T, mode="complete")[0].T[:count]
+    along = (rows * functions[:count]).sum(axis=1)
+    return rows * np.where(along < 0.0, -1.0, 1.0)[:, None]
 
 
 def _check(stage: RibStage, theta: Sequence[float]) -> tuple[float, ...]:
@@ -266,9 +271,10 @@ def discretisation(stage: RibStage) -> stage_modes.Discretisation:
 
 
 def modes_at(stage: RibStage, theta: tuple[float, ...], points: tuple[Point, ...] = ()) -> ModeSet:
-    """The modes at θ, whatever actuators, sensors and outputs it has; the last are kept.
+    """The modes at θ, with slopes of displacements at `points`, if there are any.
 
-    With slopes of displacements at points, if there are any."""
+    They are cached by what they depend on: actuators, sensors, outputs and damping do not count.
+    """
     own = replace(stage, actuators=None, sensors=None, outputs="corners", damping_ratio=0.01)
     return _modes(own, theta, points)
 
@@ -300,7 +306,7 @@ def points_of(stage: RibStage) -> tuple[Point, ...]:
 
 
 def rigid_part(stage: RibStage, theta: Array) -> tuple[Array, Array]:
-    """u_z of z, tip and tilt at the points (3, p), and (θ, 3, p)."""
+    """u_z of z, tip and tilt at the points (3, p), and its slopes (θ, 3, p)."""
     return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)
 
 
@@ -309,8 +315,10 @@ def assemble(
 ) -> Mechanics:
     """The stage's matrices from λ of the flexible modes and u_z of all at the points (n, p).
 
-    The points are its actuators and sensors, each once; `du` (θ, n, p) and `dK` (θ, n, n) are the
-    slopes of u and of K, if there are any. Read-only.
+    In M-orthonormal modes M = I and K = diag(λ), and a force at a point drives a mode by its u_z
+    there, as a sensor sees it: B = u at the actuators, C = uᵀ at the sensors. The points are these,
+    each once; `du` (θ, n, p) and `dK` (θ, n, n) are the slopes of u and of K, if there are any.
+    Read-only.
     """
     n, points = len(u), points_of(stage)
     du = np.zeros((0, *u.shape)) if du is None else du
@@ -363,13 +371,13 @@ def _displacements(
         keep = found.kept_count(index)
         F, _ = stage_modes.heights(disc, item.group, theta, points)
         own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
-        seen = [
-            slice(k * len(points), (k + 1) * len(points)) for k in range(len(item.group.images))
-        ]
+        # columns of F: the points of the first image, then those of the next
+        seen = [slice(k * len(points), (k + 1) * len(points))
+                for k in range(len(item.group.images))]  # fmt: skip
         for row, mode in own:
             u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
-        next_one = keep + bool(stage.fading)
-        modes_dK = np.zeros((0, next_one, next_one))
+        known = keep + bool(stage.fading)  # modes with slopes: `fade` needs the next one's too
+        modes_dK = np.zeros((0, known, known))
         if item.slopes:
             modes_dK, modes_du = item.slopes
             for row, mode in own:
@@ -378,8 +386,8 @@ def _displacements(
                     if other.image == mode.image:
                         dK[:, row, column] = modes_dK[:, mode.place, other.place]
         if stage.fading:
-            lam = np.diagonal(modes_dK, 0, 1, 2)
-            w, dw = fade(item.values[:next_one], lam, keep - stage.fading)
+            dlam = np.diagonal(modes_dK, 0, 1, 2)
+            w, dw = fade(item.values[:known], dlam, keep - stage.fading)
             for row, mode in own:
                 du[:, row] = w[mode.place] * du[:, row] + dw[:, mode.place, None] * u[row]
                 u[row] *= w[mode.place]
