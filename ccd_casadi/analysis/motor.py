@@ -107,7 +107,8 @@ class Motion:
 
 @dataclass(frozen=True)
 class Cycle:
-    """The setpoint, the largest and the RMS force of any motor, the heat of all: on the worst plant.
+    """The setpoint, and on the worst plant the largest and the RMS force of any motor, the heat of
+    all.
 
     `peak_share` and `heat_share` of what the motor allows; `limits` of the move in words.
     """
@@ -182,7 +183,7 @@ def _compute_held(
     free = replace(motion, motor=None)
     found = cycle_of(free, forces)
     profile, plants = found.profile, [*zip(*holding, forces, strict=True)]
-    means = [_mean_squares(profile, motion, *plant, options) for plant in plants]
+    means = [_mean_squares(profile, motion, h, d, g, options) for h, d, g in plants]
     peaks = [_peak(profile, h, way * d, g, motion.limits.stroke, options) for plant in plants
              for h, d, g in zip(*plant, strict=True) for way in (1.0, -1.0)]  # fmt: skip
     found = replace(found, peak_force=_largest(np.array(peaks)),
@@ -341,9 +342,10 @@ def motion_at(
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     plants = (free, *loads)
 
-    def forces(plants: Sequence[ScaledPlant], *hold: float) -> tuple[Array, Array]:
+    def forces(plants: Sequence[ScaledPlant], period: float, delay: float) -> tuple[Array, Array]:
         """F (5, c, m) of the first output, and dF (n_θ, 5, c, m)."""
-        each = [feedforward_slopes(one.plant_si(), one.changes_si(), *hold) for one in plants]
+        each = [feedforward_slopes(one.plant_si(), one.changes_si(), period, delay)
+                for one in plants]  # fmt: skip
         return (np.stack([F[:, :, 0] for F, _ in each], axis=1),
                 np.stack([dF[:, :, :, 0] for _, dF in each], axis=2))  # fmt: skip
 
