@@ -76,14 +76,15 @@ rms_power = {power}
 """
 PLANTS = """
 def beam(theta):
-    m, load, at = theta["m"], theta["load"], theta["at"]
+    m, at = theta["m"], theta["at"]
+    load = theta["load"] * m / 4.0  # a heavy beam carries more: slopes differ from corner to corner
     return {"mass": [[m + load, load * at], [load * at, 0.1 * m + load * at**2]],
             "stiffness": [[0.0, 0.0], [0.0, 0.0]], "damping": [[0.0, 0.0], [0.0, 0.0]],
             "input": [[1, 1], [-0.5, 0.5]], "output": [[1, -0.5], [1, 0.5]], "hardware_cost": m}
 
 
 def spring(theta, k=3e3, extra=0.0):
-    m = theta["m"] + theta["load"] + 0.0 * theta["at"] + extra
+    m = theta["m"] * (1.0 + theta["load"] / 4.0) + 0.0 * theta["at"] + extra
     return {"mass": [[m]], "stiffness": [[k * (1 + theta["at"])]], "damping": [[8.0]],
             "input": [1], "output": [1], "hardware_cost": theta["m"]}
 
@@ -116,7 +117,8 @@ def shares_by_hand(problem: CoDesignProblem, theta: np.ndarray) -> Iterator[tupl
     assert problem.source.motion.motor is not None
     allowed = problem.source.motion.motor.rms_power or np.inf
     B, C = np.array([[1.0, 1.0], [-0.5, 0.5]]), np.array([[1.0, -0.5], [1.0, 0.5]])
-    for load, at in [*itertools.product((0.0, 2.0), (-0.4, 0.3)), (0.5, 0.1)]:
+    for share, at in [*itertools.product((0.0, 2.0), (-0.4, 0.3)), (0.5, 0.1)]:
+        load = share * m / 4.0
         M = np.array([[m + load, load * at], [load * at, 0.1 * m + load * at**2]])
         M = M + motor * B @ B.T
         F = np.outer(a, np.linalg.solve(B, M @ np.linalg.solve(C, [1.0, 0.0]))) / 0.9
@@ -170,7 +172,7 @@ def test_with_an_acceleration_the_worst_corner_is_what_is_constrained(
         r, k = profile.at(np.linspace(0.0, profile.duration, 20001)).real, 20.0 * 0.9
         worst = np.zeros(2)
         for load, at in itertools.product((0.0, 2.0), (-0.4, 0.3)):
-            h, g = 3e3 * (1.0 + at), 5.0 + load
+            h, g = 3e3 * (1.0 + at), 4.1 * (1.0 + load / 4.0) + 0.9
             ways = [(h * r[0] + way * 8.0 * r[1] + g * r[2]) / 0.9 for way in (1.0, -1.0)]
             mean = np.mean([(F**2).mean() for F in ways]) * profile.duration
             mean += 0.5 * 0.1 * (h * 0.02 / 0.9) ** 2
