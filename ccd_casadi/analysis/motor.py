@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Any, ClassVar
 
@@ -10,14 +10,14 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from ccd_casadi.analysis import MOTOR_LIMITS, MoveLimits
+from ccd_casadi.analysis import MOTOR_LIMITS, Loads, MoveLimits
 from ccd_casadi.analysis.feedforward import feedforward_slopes, forward_force
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.fixed_parameters import reparametrise
-from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
-from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import UserError
@@ -88,6 +88,8 @@ class Motion:
         None: it does not limit.
     output : tuple of float (p,)
         Of several sensors on one actuator: uᵀy moves; empty: the first output.
+    loads : Loads
+        That its motor has to move; what identifies a plant has them of their own.
     """
 
     limits: MoveLimits
@@ -95,6 +97,7 @@ class Motion:
     dwell: float = 0.0
     motor: Motor | None = None
     output: tuple[float, ...] = field(default=(), repr=False)  # which the controller says, too
+    loads: Loads = field(default=Loads(), repr=False)
 
     @property
     def required(self) -> bool:
@@ -104,7 +107,8 @@ class Motion:
 
 @dataclass(frozen=True)
 class Cycle:
-    """The setpoint, the largest and the RMS force of any motor, the heat of all.
+    """The setpoint, and on the worst plant the largest and the RMS force of any motor, the heat of
+    all.
 
     `peak_share` and `heat_share` of what the motor allows; `limits` of the move in words.
     """
@@ -123,17 +127,18 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
 
     Of free bodies F = g r̈. Where springs or magnets hold the output, F = h r + d ṙ + g r̈: the
     cycle leads from the place without force, r = 0, to `distance`, and back after a dwell. The way
-    back has these forces in reverse order with -d, since r(t) + r(T - t) = `distance`.
+    back has these forces in reverse order with -d, since r(t) + r(T - t) = `distance`. Of several
+    plants one setpoint: the peak is that of the plant where it is largest, and so is the heat.
 
     Parameters
     ----------
     motion : Motion
         With its limits.
-    forces : (m,) array
-        g per unit acceleration, kg.
+    forces : (m,) or (c, m) array
+        g per unit acceleration, kg; of each of c plants.
     mass : float
         Moving mass of the motor, kg; complex for derivatives.
-    holding : (2, m) array, optional
+    holding : (2, m) or (2, c, m) array, optional
         h and d per unit of the position and its velocity, N/m and N s/m.
 
     Returns
@@ -146,11 +151,12 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0, holding: Array | No
     UserError
         The output is held, and the motor is to find the acceleration.
     """
+    forces = np.atleast_2d(forces)
     if holding is not None:
         if not motion.required:
             words = "is missing: a spring or a magnet holds the output, whose force the motor needs"
             raise UserError(f"move.acceleration: {words} besides; give it")
-        return _compute_held(motion, forces, mass, holding)
+        return _compute_held(motion, forces, mass, holding.reshape(2, *forces.shape))
     allowed, motor = motion.limits, motion.motor
     acceleration, why = allowed.acceleration, "acceleration"
     if motor is not None and not motion.required:
@@ -172,27 +178,35 @@ def _compute_held(
     motion: Motion, forces: Array, mass: Any, holding: Array,
     options: MotionOptions = MotionOptions(),
 ) -> Cycle:  # fmt: skip
-    """Compute the cycle of an output that is held, h and d per unit of place and velocity."""
+    """Compute the cycle of an output that is held, h and d (2, c, m) per unit of place and
+    velocity."""
     free = replace(motion, motor=None)
     found = cycle_of(free, forces)
-    profile, far = found.profile, motion.limits.stroke
-    x, weights = np.polynomial.legendre.leggauss(options.nodes)
-    r, v, a, *_ = profile.inside(0.5 * (1.0 + x))
-    h, d, g = (each[:, None, None] for each in (*holding, forces))
-    squares = (h * r + g * a) ** 2 + (d * v) ** 2  # what else d adds there it takes on the way back
-    there = (squares @ (0.5 * weights)) @ profile.durations
-    rest = 0.5 * motion.dwell * (holding[0] * far) ** 2  # at `distance`: every second dwell
-    mean = (there + rest) / (profile.durations.sum() + motion.dwell)
-    peaks = [_peak(profile, h, way * d, g, far, options)
-             for h, d, g in zip(*holding, forces, strict=True) for way in (1.0, -1.0)]  # fmt: skip
+    profile, plants = found.profile, [*zip(*holding, forces, strict=True)]
+    means = [_mean_squares(profile, motion, h, d, g, options) for h, d, g in plants]
+    peaks = [_peak(profile, h, way * d, g, motion.limits.stroke, options) for plant in plants
+             for h, d, g in zip(*plant, strict=True) for way in (1.0, -1.0)]  # fmt: skip
     found = replace(found, peak_force=_largest(np.array(peaks)),
-                    rms_force=_largest(mean) ** 0.5)  # fmt: skip
+                    rms_force=_largest(np.array(means)) ** 0.5)  # fmt: skip
     if motion.motor is None:
         return found
     k, R, i_peak = motion.motor.at(mass)
-    power = R / k**2 * mean.sum()
+    power = R / k**2 * _largest(np.array([mean.sum() for mean in means]))
     return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
                    heat_share=power / (motion.motor.rms_power or np.inf))  # fmt: skip
+
+
+def _mean_squares(
+    profile: Setpoint, motion: Motion, h: Array, d: Array, g: Array, options: MotionOptions
+) -> Any:
+    """The mean square of each motor's force, there and back with dwells, N²."""
+    x, weights = np.polynomial.legendre.leggauss(options.nodes)
+    r, v, a, *_ = profile.inside(0.5 * (1.0 + x))
+    rest = 0.5 * motion.dwell * (h * motion.limits.stroke) ** 2  # every second dwell: at `distance`
+    h, d, g = (each[:, None, None] for each in (h, d, g))
+    squares = (h * r + g * a) ** 2 + (d * v) ** 2  # what else d adds there it takes on the way back
+    there = (squares @ (0.5 * weights)) @ profile.durations
+    return (there + rest) / (profile.durations.sum() + motion.dwell)
 
 
 def _peak(profile: Setpoint, h: Any, d: Any, g: Any, far: float, options: MotionOptions) -> Any:
@@ -220,7 +234,8 @@ def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle
     if motor is None:
         return found
     k, R, i_peak = motor.at(mass)
-    power = R / k**2 * (forces**2).sum() * mean
+    squares = _largest(np.array([(row**2).sum() for row in forces]))
+    power = R / k**2 * squares * mean
     heat_share = power / (motor.rms_power or np.inf)
     return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
                    heat_share=heat_share)  # fmt: skip
@@ -228,7 +243,7 @@ def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle
 
 def _largest(forces: Array) -> Any:
     """The largest of their sizes."""
-    found = max(forces, key=lambda force: abs(np.real(force)))
+    found = max(forces.ravel(), key=lambda force: abs(np.real(force)))
     return found if np.real(found) > 0.0 else -found
 
 
@@ -262,9 +277,9 @@ class MotionAt:
         Its cycle, and those with each parameter a step along the imaginary axis away.
     forward, forward_slopes : (5, m), (n_θ, 5, m) array
         Feedforward per derivative of the setpoint, and its derivatives to θ.
-    inertia, holding : (m,) array, (2, m) array or None
-        g, and h and d, of the machine itself, without hold, delay, amplifiers and filters; None:
-        nothing holds the output.
+    inertia, holding : (c, m) array, (2, c, m) array or None
+        g, and h and d, of the model and of each other load with a weak motor, of the machine
+        itself, without hold, delay, amplifiers and filters; None: nothing holds the output.
     """
 
     motion: Motion
@@ -277,9 +292,11 @@ class MotionAt:
     holding: Array | None = None
 
     def body_forces(self, r: Array) -> Array:
-        """The forces (N, m) of a setpoint (5, N) that the cycle counts: g r̈; h r + d ṙ if held."""
-        forces = np.outer(r[2], self.inertia)
-        return forces if self.holding is None else forces + r[:2].T @ self.holding
+        """The forces (N, m) of a setpoint (5, N) that the cycle counts, g r̈ and h r + d ṙ if held,
+        on the plant that they heat most."""
+        held = np.zeros((2, *self.inertia.shape)) if self.holding is None else self.holding
+        each = [np.outer(r[2], g) + r[:2].T @ held[:, i] for i, g in enumerate(self.inertia)]
+        return max(each, key=lambda forces: float((forces**2).sum()))
 
     def forward_force(self, sampling: Sampling | None) -> float:
         """The largest force of the feedforward on any motor, with all its terms.
@@ -313,30 +330,41 @@ class MotionAt:
 
 def motion_at(
     motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None,
-    options: MotionOptions = MotionOptions(),
+    loads: Sequence[ScaledPlant] = (), options: MotionOptions = MotionOptions(),
 ) -> MotionAt:  # fmt: skip
-    """Compute the move of a square plant whose rigid bodies are free; `mass` of the motor is
-    parameter `place` of θ.
+    """Compute the move of a square plant whose rigid bodies are free, with motors for other `loads`
+    too; `mass` of the motor is parameter `place` of θ.
+
+    A force constant that is less by the gain's error needs F/(1 - gain), on whatever plant.
 
     Raises UserError where the output is held and no acceleration is given.
     """
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
-    F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
-    ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
-    g, dg, h, dh = ahead[2], slopes[:, 2], None, slopes[:, :2]
-    found = cycle_of(motion, g, mass)
-    if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
-        body = free.mechanics or free  # what is late or filtered adds to F₂ where F₀ is not zero
-        F, dF = feedforward_slopes(body.plant_si(), body.changes_si(), 0.0, 0.0)
-        g, dg, h, dh = F[2, :, 0], dF[:, 2, :, 0], F[:2, :, 0], dF[:, :2, :, 0]
-        found = cycle_of(motion, g, mass, h)
+    plants = (free, *loads)
+
+    def forces(plants: Sequence[ScaledPlant], period: float, delay: float) -> tuple[Array, Array]:
+        """F (5, c, m) of the first output, and dF (n_θ, 5, c, m)."""
+        each = [feedforward_slopes(one.plant_si(), one.changes_si(), period, delay)
+                for one in plants]  # fmt: skip
+        return (np.stack([F[:, :, 0] for F, _ in each], axis=1),
+                np.stack([dF[:, :, :, 0] for _, dF in each], axis=2))  # fmt: skip
+
+    F, dF = forces(plants, *hold)
+    ahead, slopes, weak = F[:, 0], dF[:, :, 0], 1.0 - motion.loads.gain
+    F, dF, h, dh = F / weak, dF / weak, None, dF[:, :2]
+    found = cycle_of(motion, F[2], mass)
+    if np.abs(F[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
+        # what is late or filtered adds to F₂ where F₀ is not zero
+        F, dF = (each / weak for each in forces([one.mechanics or one for one in plants], 0.0, 0.0))
+        h, dh = F[:2], dF[:, :2]
+        found = cycle_of(motion, F[2], mass, h)
     step = 1j * options.complex_step
     stepped = tuple(
-        cycle_of(motion, g + step * dg[i], mass + step * (i == place),
+        cycle_of(motion, F[2] + step * dF[i, 2], mass + step * (i == place),
                  None if h is None else h + step * dh[i])
         for i in range(len(slopes))
     )  # fmt: skip
-    return MotionAt(motion, mass, found, stepped, ahead, slopes, g, h)
+    return MotionAt(motion, mass, found, stepped, ahead, slopes, F[2], h)
 
 
 class DrivenMechanics:
@@ -354,15 +382,18 @@ class DrivenMechanics:
         Then this, kg.
     inputs : int
         Of the plant, each with a motor, the first ones.
+    loads : callable
+        The plant alone of each option over θ and, last, what varies; called when they are needed.
     """
 
     keep: Any = None  # what CasADi does not keep
 
     def __init__(
-        self, evaluate: Evaluate, motion: Motion, place: int | None, fixed: float, inputs: int
-    ) -> None:
+        self, evaluate: Evaluate, motion: Motion, place: int | None, fixed: float, inputs: int,
+        loads: Callable[[], Sequence[Plant]] = tuple,
+    ) -> None:  # fmt: skip
         self.evaluate, self.motion, self.place, self.fixed = evaluate, motion, place, fixed
-        self.inputs = inputs
+        self.inputs, self.loads = inputs, loads
 
     def own(self, theta: Sequence[float]) -> tuple[float, ...]:
         """θ of the plant alone."""
@@ -390,14 +421,33 @@ class DrivenMechanics:
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
         """The move at θ. Raises UserError as `motion_at`."""
+        model, ranges = self._moved(theta), self.motion.loads.ranges
+        wide = self._loaded if self.motion.loads.options or ranges else (self,)
+        # with ranges every option is read at its own point alone
+        known = (model, *(model if ranges else one._moved(theta) for one in wide[1:]))
+        uncertain = UncertainPlant(
+            known, 1.0, ranges=ranges,
+            along=lambda option, values: wide[option]._moved((*theta, *values.tolist())),
+        )  # fmt: skip
+        free, *loads = uncertain.plants(uncertain.corners())
+        return motion_at(self.motion, free, self.mass(theta), self.place, sampling, loads)
+
+    @cached_property
+    def _loaded(self) -> tuple["DrivenMechanics", ...]:
+        """Every option with its motors, over θ and what varies."""
+        return tuple(
+            DrivenMechanics(plant.evaluate, self.motion, self.place, self.fixed, self.inputs)
+            for plant in self.loads()
+        )
+
+    def _moved(self, theta: Sequence[float]) -> Mechanics:
+        """The matrices with the output that moves."""
         found, row = self(theta), np.array([self.motion.output])
-        if self.motion.output:
-            own = (*found.derivatives[:4], row @ found.derivatives[4])
-            found = replace(found, C=row @ found.C, derivatives=own,
-                            wiring=found.wiring.of_output(row[0]))  # fmt: skip
-        free = without_hidden_rigid_modes(modal_plant(found, FREE))
-        bare = scale_plant(free, 1.0, bare=True)
-        return motion_at(self.motion, bare, self.mass(theta), self.place, sampling)
+        if not self.motion.output:
+            return found
+        own = (*found.derivatives[:4], row @ found.derivatives[4])
+        wiring = found.wiring.of_output(row[0])
+        return replace(found, C=row @ found.C, derivatives=own, wiring=wiring)
 
 
 def with_motion(
@@ -406,6 +456,7 @@ def with_motion(
     names: Sequence[str],
     held: Mapping[str, float],
     inputs: int | None = None,
+    loads: Callable[[], Sequence[Plant]] = tuple,
 ) -> Plant:
     """A plant with the mass, the power and the peak force of its motors.
 
@@ -421,6 +472,9 @@ def with_motion(
         Fixed parameters by name, SI; the motor's size may be among them.
     inputs : int, optional
         The first ones of the plant, which have motors; left out, all.
+    loads : callable
+        The plant of each option of `motion.loads`, the model's first, over its own parameters and,
+        last, those that vary.
 
     Returns
     -------
@@ -433,7 +487,7 @@ def with_motion(
     fixed = 0.0 if motor is None else held.get(size, motor.moving_mass[0])
 
     def of(evaluate: Evaluate) -> DrivenMechanics:
-        return DrivenMechanics(evaluate, motion, place, fixed, inputs or plant.inputs)
+        return DrivenMechanics(evaluate, motion, place, fixed, inputs or plant.inputs, loads)
 
     own, domain = of(plant.evaluate), plant.domain
     if domain is not None and motor is not None and place is not None:

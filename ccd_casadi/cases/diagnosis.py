@@ -343,8 +343,8 @@ def plant_report(
 
 
 def _move(problem: CoDesignProblem) -> dict[str, Any] | None:
-    """The move at the start of θ and what it needs by its rigid body, keys as in result.json; None
-    where the case has none, or the plant cannot make it."""
+    """The move at the start of θ and what its rigid body needs on the worst plant, keys as in
+    result.json; None where the case has none, or the plant cannot make it."""
     motion = problem.source.motion
     if motion is None:
         return None
@@ -362,6 +362,7 @@ def _move(problem: CoDesignProblem) -> dict[str, Any] | None:
         }  # fmt: skip
     return {
         "distance": motion.limits.stroke, "duration": cycle.profile.duration,
+        "worst": len(found.inertia) > 1 or found.motion.loads.gain > 0.0,
         "limits": list(cycle.limits), "peak_force": float(cycle.peak_force),
         "rms_force": float(cycle.rms_force), **of_motor,
     }  # fmt: skip

@@ -1,11 +1,12 @@
 """What a co-design problem states of its controller, and what of it J counts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ccd_casadi.analysis import Loads
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
@@ -107,6 +108,10 @@ class ControllerProblem:
     def plant_options(self) -> tuple[Options, ...]:
         """Further option sets of the plant that the controller is for."""
         return ()
+
+    def loads_with(self, held: Mapping[str, float]) -> Loads:
+        """Return what motors move beside the model, given the values of fixed parameters."""
+        return Loads()
 
     def require_plants(self, plants: Sequence[Plant]) -> None:
         """Raise PlantError unless such a controller can be designed for each of the plants."""

@@ -83,7 +83,7 @@ def constraint_sizes(problem: CoDesignProblem) -> Array:
     array (m,)
         Positive, in the units of λ.
     """
-    return _sizes(problem.source, problem.names, problem.lower, problem.upper, problem.start)
+    return _sizes(problem.driven, problem.names, problem.lower, problem.upper, problem.start)
 
 
 def constraint_shares(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> Array:

@@ -12,6 +12,7 @@ from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ccd_casadi.analysis import Loads
 from ccd_casadi.lti.wiring import UNWIRED, Wiring
 from ccd_casadi.plants.model_function import ModelFunction, widen
 from ccd_casadi.plants.plant import Plant
@@ -211,6 +212,11 @@ class PlantSource:
         """The fixed parameters' values."""
         return {name: value for name, value, _ in self.fixed}
 
+    def with_options(self, options: Iterable[tuple[str, object]]) -> "PlantSource":
+        """The same with some options replaced."""
+        merged = tuple(sorted((dict(self.options) | dict(options)).items()))
+        return replace(self, options=merged)
+
     def pin(self) -> "PlantSource":
         """The same, with the hash of its files' content: a process must not keep an older one."""
         if self.file is None or self.content is not None:
@@ -242,8 +248,16 @@ class PlantSource:
             **({"fixed": self.held} if self.fixed else {}),
             **({"places": self.places.identity} if self.places else {}),
             **({"motion": repr(self.motion)} if self.motion else {}),
+            **self._identity_of_loads(),
             **({"wiring": repr(self.wiring)} if self.wiring else {}),
         }
+
+    def _identity_of_loads(self) -> dict[str, str]:
+        """What its motors move beside the model, where they limit the move."""
+        motion = self.motion
+        if motion is None or motion.motor is None or motion.loads == Loads():
+            return {}
+        return {"loads": repr(motion.loads)}
 
 
 def _digest(path: Path) -> str:
@@ -281,7 +295,18 @@ def _build(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         count = _below(own, size, names, lower, upper).inputs if source.wide else plant.inputs
         from ccd_casadi.analysis.motor import with_motion
 
-        return with_motion(plant, motion, names, source.held, count)
+        def loads() -> list[Plant]:
+            """The plant of every option, over θ and what varies, as a set of plants has them."""
+            ranges = motion.loads.ranges
+            varying = tuple(name for name, *_ in ranges)
+            alone = replace(own, fixed=tuple(f for f in own.fixed if f[0] not in varying))
+            return [
+                _below(alone.with_options(options), size, (*names, *varying),
+                       (*lower, *(low for _, low, *_ in ranges)), (*upper, *(r[3] for r in ranges)))
+                for options in ((), *motion.loads.options)
+            ]  # fmt: skip
+
+        return with_motion(plant, motion, names, source.held, count, loads)
     if wiring := source.wiring:
         from ccd_casadi.plants.fixed_parameters import with_wiring
 

@@ -122,7 +122,7 @@ class CoDesignProblem(NotebookHtml):
             perturbed["compliance"] = True
         return {
             "numerics": NUMERICS,
-            "plant": self.source.identity(),
+            "plant": self.driven.identity(),
             "theta": list(self.names),
             "suspension": [
                 self.suspension.frequency_hz,
@@ -143,6 +143,15 @@ class CoDesignProblem(NotebookHtml):
     def controller_identity(self) -> dict[str, Any]:
         """The part of `identity` that its controller states."""
         return self.controller.identity_with(self.weights, self.budget)
+
+    @property
+    def driven(self) -> PlantSource:
+        """The source of its plant, whose motors move what its controller has to serve too."""
+        motion = self.source.motion
+        if motion is None:
+            return self.source
+        loads = self.controller.loads_with(self.source.held)
+        return replace(self.source, motion=replace(motion, loads=loads))
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -191,7 +200,7 @@ def plant_of(problem: CoDesignProblem) -> Plant:
         A user's function must not run.
     """
     use_units(*problem.spoken)
-    return plant_from(problem.source, problem.names, problem.lower, problem.upper)
+    return plant_from(problem.driven, problem.names, problem.lower, problem.upper)
 
 
 def notes_of(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[str, ...]:
@@ -510,6 +519,4 @@ def with_options(
     -------
     CoDesignProblem
     """
-    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
-    source: PlantSource = replace(problem.source, options=merged)
-    return replace(problem, source=source)
+    return replace(problem, source=problem.source.with_options(options))

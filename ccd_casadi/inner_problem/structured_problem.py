@@ -7,10 +7,11 @@
 Everything is plain values, as in `problem`: it is hashed, sent to workers and kept in the store.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from ccd_casadi.analysis import Loads
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.inner_problem.controller_problem import (
@@ -152,6 +153,13 @@ class StructuredProblem(ControllerProblem):
     @property
     def plant_options(self) -> tuple[Options, ...]:
         return self.uncertainty.options
+
+    def loads_with(self, held: Mapping[str, float]) -> Loads:
+        """Return the corners of what varies and every option, with the weakest motor."""
+        u = self.uncertainty
+        ranges = tuple((name, low, held[name], high)
+                       for name, low, high in u.ranges if name in held)  # fmt: skip
+        return Loads(ranges, u.gain, u.options)
 
     def require_plants(self, plants: Sequence[Plant]) -> None:
         """Raise PlantError unless each has as many inputs as outputs, and channels for them."""

@@ -136,7 +136,7 @@ def cycle_chapter(
     if not own.required:
         watts = shown["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
-        times = [cycle_of(each, found.forward[2], found.mass).profile.duration for each in limited]
+        times = [cycle_of(each, found.inertia, found.mass).profile.duration for each in limited]
         curve = c.Curve(watts, 1e3 * (np.array(times) + late))
         here = c.Level(shown["power"], "this design", vertical=True)
         panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
@@ -144,7 +144,9 @@ def cycle_chapter(
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
     held = found.holding is not None
-    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held, lagged)
+    worst = len(found.inertia) > 1 or found.motion.loads.gain > 0.0
+    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held, lagged,
+             worst)  # fmt: skip
     words = paragraph("report.cycle", shown, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]

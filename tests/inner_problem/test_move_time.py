@@ -528,10 +528,12 @@ def test_the_heat_of_a_move_is_that_of_the_hottest_plant(tmp_path: Path, stiffne
     assert found["needed_power"] == pytest.approx(2.0 / 20.0**2 * squares[hottest], rel=1e-6)
     assert found["needed_heat_share"] == pytest.approx(found["needed_power"] / 2000.0)
     assert not heat_concern({"move": found})
-    assert found["needed_power"] > 1.1 * found["power"]
-    hot = problem_with(0.5 * (found["power"] + found["needed_power"]))
+    hot = problem_with(found["needed_power"] / 1.04)
     entry = move_entry(hot, hot.start, K)
-    assert entry["move"]["heat_share"] < 1.0 < entry["move"]["needed_heat_share"]
+    assert entry["move"]["needed_heat_share"] > 1.0
+    # the constraint is of the heavy slide with the weak motor, beyond which is the feedback; what a
+    # spring takes at rest the feedback has not found by then
+    assert stiffness or entry["move"]["heat_share"] < 1.0
     (concern,) = heat_concern(entry)
     assert f"on the worst of 5 plants ({hottest})" in concern.words
     assert f"rms_power is {hot.source.motion.motor.rms_power:.4g} W" in concern.words
