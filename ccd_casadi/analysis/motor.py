@@ -1,6 +1,6 @@
 """Motors that are designed with the plant: the cycle of a move, its forces and heat; their mass."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from operator import attrgetter
@@ -32,6 +32,7 @@ class MotionOptions:
     nodes: int = 5  # of Gauss and Legendre in each interval of a setpoint: exact for squares
     shares: int = 17  # instants in each interval, where Newton's step to a peak force begins
     instants: int = 2000  # of a continuous move, at which its feedforward is examined
+    inside: tuple[float, ...] = (0.25, 0.5, 0.75)  # of what varies: loads beside its corners
     beside: float = 1e-9  # of the duration: how far beside a jump of the snap, too
 
 
@@ -429,7 +430,7 @@ class DrivenMechanics:
             known, 1.0, ranges=ranges,
             along=lambda option, values: wide[option]._moved((*theta, *values.tolist())),
         )  # fmt: skip
-        free, *loads = uncertain.plants(uncertain.corners())
+        free, *loads = uncertain.plants([*uncertain.corners(), *_inside(uncertain)])
         return motion_at(self.motion, free, self.mass(theta), self.place, sampling, loads)
 
     @cached_property
@@ -448,6 +449,19 @@ class DrivenMechanics:
         own = (*found.derivatives[:4], row @ found.derivatives[4])
         wiring = found.wiring.of_output(row[0])
         return replace(found, C=row @ found.C, derivatives=own, wiring=wiring)
+
+
+def _inside(
+    uncertain: UncertainPlant, options: MotionOptions = MotionOptions()
+) -> Iterator[tuple[int, Array]]:
+    """Points of the box on which one parameter varies: a force may be largest between the ends."""
+    lower, upper = uncertain.box
+    for option in range(len(uncertain.options)):
+        for i in range(len(uncertain.names)):
+            for share in options.inside:
+                point = uncertain.nominal.copy()
+                point[i] = lower[i] + share * (upper[i] - lower[i])
+                yield option, point
 
 
 def with_motion(

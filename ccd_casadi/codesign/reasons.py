@@ -78,7 +78,9 @@ class Reason(Enum):
         "not optimal: a multi-start search at this theta found a controller with {better_shown} "
         "instead of {own_shown}"
     )
-    BOUND_EXCEEDED = "not optimal: a constraint or bound of theta is exceeded by {primal:.2g}"
+    BOUND_EXCEEDED = (
+        "not optimal: a constraint or bound of theta is exceeded by {primal:.2g} of its size"
+    )
     NOT_STATIONARY = "not optimal: KKT residual {kkt_residual:.3g} over theta, above {kkt_level:g}"
     KINK_FALLS = "not optimal: J has a kink and falls on a side of it"
     NO_GRADIENT = (

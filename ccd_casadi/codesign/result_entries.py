@@ -122,6 +122,8 @@ def move_entry(
                    for of in ("peak_force", "peak_command"))  # fmt: skip
     commanded = {} if made[0].command is None else {"needed_command": max(ahead, given)}
     needed = max(float(cycle.peak_force), most, 0.0 if commanded else ahead)
+    strongest = int(np.argmax([one.peak_force.max() for one in made]))
+    words = kind_of(problem).plant_words(theta)
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
     k, R, limit = (1.0, 0.0, np.inf) if own.motor is None else own.motor.at(motion.mass)
     squares = np.array([move.mean_squares(seconds) for move in made])  # of forces that currents
@@ -147,7 +149,8 @@ def move_entry(
         "feedforward_force": ahead,
         "needed_force": needed,
         "needed_rms_force": float(squares.max() ** 0.5),
-        "needed_heat_plant": kind_of(problem).plant_words(theta)[hottest],
+        "needed_force_plant": words[strongest] if needed == most else "",
+        "needed_heat_plant": words[hottest],
         **commanded,  # before the actuators
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip

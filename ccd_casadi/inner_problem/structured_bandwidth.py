@@ -38,6 +38,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import structured_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
@@ -93,7 +94,12 @@ def require_motion(problem: CoDesignProblem) -> None:
     if plant.inputs != plant.outputs and not (motion and motion.output):
         words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
         raise PlantError(f"{words} of one as of the other")
-    motion_of(problem, problem.start)
+    try:
+        motion_of(problem, problem.start)
+    except np.linalg.LinAlgError:  # of the loads: a mass that varies
+        mechanics(plant, problem.start)  # which says it of the model
+        words = "mass is not positive definite at an end of what varies"
+        raise PlantError(f"{words}; give every coordinate a mass, or narrow its range") from None
 
 
 def exact_moves(motion: MotionAt, loops: Sequence[Loop], until: float = 0.0) -> list[Move]:

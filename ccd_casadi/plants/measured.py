@@ -72,6 +72,15 @@ class MeasuredResponse:
     undamped_hz: tuple[float, ...] = ()
     options: ClassVar[MeasuredResponseOptions] = MeasuredResponseOptions()
 
+    def _not_finite(self) -> str:
+        """Where the first number is that is not finite."""
+        lines = np.flatnonzero(~np.isfinite(self.hz))
+        if lines.size:
+            return f"has no frequency at line {lines[0] + 1}"
+        line, out, into = np.argwhere(~np.isfinite(self.matrix))[0]
+        at = f"is not finite at {self.hz[line]:.6g} Hz"
+        return at if self.G.ndim == 1 else f"{at}, output {out + 1}, input {into + 1}"
+
     def __post_init__(self) -> None:
         shape = self.G.shape
         if self.spread is not None and (
@@ -85,13 +94,19 @@ class MeasuredResponse:
         ):  # fmt: skip
             raise UserError("a measured response needs five lines or more, one value at each")
         if not (np.isfinite(self.hz).all() and np.isfinite(self.G).all()):
-            raise UserError("a measured response holds finite numbers only; drop the other lines")
+            raise UserError(f"a measured response {self._not_finite()}; drop that line")
         if self.hz[0] <= 0.0 or (np.diff(self.hz) <= 0.0).any():
             raise UserError("the lines of a measured response have to rise from above 0 Hz")
-        still = (self.matrix == 0.0).all(axis=(1, 2))
-        if still.any():
-            at = f"{self.hz[np.argmax(still)]:.6g} Hz"
-            raise UserError(f"a measured response is 0 at {at}; drop that line")
+        still = self.matrix == 0.0
+        for where, dead in (
+            ("", still.all(axis=(1, 2))[:, None]),
+            (" in output {}, whatever the input", still.all(axis=2)),
+            (" in every output of input {}", still.all(axis=1)),
+        ):
+            if dead.any():
+                line, number = np.argwhere(dead)[0]
+                at = f"{self.hz[line]:.6g} Hz{where.format(number + 1)}"
+                raise UserError(f"a measured response is 0 at {at}; drop that line")
 
     @property
     def matrix(self) -> np.ndarray:

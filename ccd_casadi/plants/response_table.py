@@ -225,7 +225,8 @@ def _understood(
             raise UserError(f"{path}: re and im have different units; give both in m/N")
         G = (parts["re"] + 1j * parts["im"]) * known["re"][1]
     elif given == {"G"}:
-        G = parts["G"] * known["G"][1]
+        with np.errstate(invalid="ignore"):  # what is not finite is refused by its line
+            G = parts["G"] * known["G"][1]
         if not np.iscomplexobj(G) or not G.imag.any():
             words = f"{known['G'][0].name}: is real, so its phase is missing; give a complex G"
             raise UserError(f"{path}: {words}, or re and im")

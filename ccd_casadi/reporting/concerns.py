@@ -39,6 +39,7 @@ class ConcernKind(StrEnum):
     SET_SEARCHED = "set_searched"
     UNSTABLE_CONTROLLER = "unstable_controller"
     MOVE = "move"
+    LATE = "late"
     CURRENT = "current"
     HEAT = "heat"
     LOOP = "loop"
@@ -153,7 +154,7 @@ def loop_concerns(
         [Concern(ConcernKind.LOOP, words) for words in each]
         for each in (found, result.get("loop_warnings", ()))
     )
-    motor = (*current_concern(result), *heat_concern(result))
+    motor = (*current_concern(result), *heat_concern(result), *late_move_concern(result))
     return [*own, *line_concern(result, options), *motor, *warned]
 
 
@@ -179,8 +180,10 @@ def current_concern(
     share = move.get("needed_share")
     if share is None or not share > 1.0 + options.slack:
         return []
-    most = move["needed_current"] / share
-    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback"
+    most, where = move["needed_current"] / share, ""
+    if move["plants"] > 1 and move.get("needed_force_plant"):
+        where = f" on the worst of {move['plants']} plants ({move['needed_force_plant']})"
+    words = f"the move needs {move['needed_current']:.4g} A with feedforward and feedback{where}"
     return [Concern(ConcernKind.CURRENT, f"{words}, and peak_current is {most:.4g} A")]
 
 
@@ -200,6 +203,36 @@ def heat_concern(
         where = f" on the worst of {move['plants']} plants ({move['needed_heat_plant']})"
     words = f"the move needs {power:.4g} W with feedforward and feedback{where}"
     return [Concern(ConcernKind.HEAT, f"{words}, and rms_power is {power / share:.4g} W")]
+
+
+def late_move_concern(result: Mapping[str, Any]) -> list[Concern]:
+    """List a move that settles on the worst plant only when the next one has begun; empty where it
+    settles before, or where moves do not follow each other."""
+    move = result.get("move") or {}
+    if not move.get("dwell") or move["plants"] < 2:
+        return []
+    cycle, latest = move["duration"] + move["dwell"], move["settled_latest"]
+    if latest is not None and latest <= cycle:
+        return []
+    when = "does not settle" if latest is None else f"settles after {with_unit(latest, 's')}"
+    words = f"the move {when} on the worst of {move['plants']} plants, and the next one begins"
+    return [Concern(ConcernKind.LATE, f"{words} after {with_unit(cycle, 's')}")]
+
+
+def motor_remedies(result: Mapping[str, Any]) -> dict[ConcernKind, str]:
+    """Say how a move leaves its motor what feedback needs, where the motor sets the acceleration:
+    with limits stated lower by the share that is missing."""
+    move = result.get("move") or {}
+    limits, found = move.get("limits", ()), dict[ConcernKind, str]()
+    heat, current = move.get("needed_heat_share"), move.get("needed_share")
+    stated = "{} = {:g} in [motor], which leaves feedback its share"
+    if "heat" in limits and heat:
+        least = inwards(move["needed_power"] / heat**2, 3, 3)
+        found[ConcernKind.HEAT] = stated.format("rms_power", least)
+    if "peak force" in limits and current:
+        least = inwards(move["needed_current"] / current**2, 3, 3)
+        found[ConcernKind.CURRENT] = stated.format("peak_current", least)
+    return found
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:

@@ -20,6 +20,7 @@ from ccd_casadi.reporting.concerns import (
     limited_move_remedy,
     lines_of,
     loop_concerns,
+    motor_remedies,
     open_bound,
     resonance_condition,
     why_unproven,
@@ -37,7 +38,8 @@ NEXT = {  # what to do about a line that failed, or about what the decision name
     "unproven": "a smaller [robust] set, or fewer parameters in it",
     "budget": "solve again with a larger --budget, which resumes this search",
     "current": "a larger peak_current, or less jerk or acceleration in [move]",
-    "heat": "less acceleration, given in [move]; then a longer dwell or a larger rms_power",
+    "heat": "less acceleration in [move], a longer dwell or a larger rms_power",
+    "late": "`ccd feedforward` for the set, a longer dwell, or more bandwidth",
     "loop": "with sections least_damping, weighted_level or bandwidth_least_hz; a smaller S_max",
 }
 
@@ -79,6 +81,7 @@ WARNINGS = (  # with those that fail `optimal`, which only warn where a budget e
     Reason.EXTRAPOLATES, Reason.LEFT_OUT_TOO_FAR, Reason.SHARE_ALONE, Reason.PEAK_ABOVE,
     Reason.WEIGHTED_ABOVE, Reason.BETWEEN_ABOVE,
 )  # fmt: skip
+MOTOR = (ConcernKind.CURRENT, ConcernKind.HEAT, ConcernKind.LATE)  # of the move and its motor
 SENTENCES = {
     Build.YES: "Build this.",
     Build.AFTER_DEPLOY: "Build this after deploy: hold and delay are not judged yet.",
@@ -223,7 +226,7 @@ def decide(result: Mapping[str, Any]) -> Decision:
         of_search.append(Concern(ConcernKind.LINE_UNKNOWN, words))
     # the machine first, then what is not known of its bounds, then what a longer search may change
     loop = loop_concerns(result)
-    motor = [one for one in loop if one.reason in (ConcernKind.CURRENT, ConcernKind.HEAT)]
+    motor = [one for one in loop if one.reason in MOTOR]
     loop = [one for one in loop if one not in motor]
     concerns = [*missed, *motor, *survival, *warned.values(), *loop, *of_search]
     unjudged = states.get("deployable") == State.UNKNOWN
@@ -237,11 +240,13 @@ def decide(result: Mapping[str, Any]) -> Decision:
         ConcernKind.MISPREDICTED: "predicted",
         ConcernKind.CURRENT: "current",
         ConcernKind.HEAT: "heat",
+        ConcernKind.LATE: "late",
         ConcernKind.LOOP: "loop",
         ConcernKind.BETWEEN_LINES: "loop",
         ConcernKind.BUDGET: "budget",
     }
     next_ = NEXT | {"unproven": open_bound(result).remedy or NEXT["unproven"]}
+    next_ |= {remedies[kind]: words for kind, words in motor_remedies(result).items()}
     named = (remedies[one.reason] for one in concerns if one.reason in remedies)
     steps = tuple(dict.fromkeys(next_[name] for name in named))
     return Decision(Build.IF_ACCEPTED, tuple(concerns), steps, (), unjudged, condition, besides)

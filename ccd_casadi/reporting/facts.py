@@ -215,11 +215,17 @@ def _requirement_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for one in result.get("requirements", ()):
         margin = one["margin"]
         of_lambda = one["required"] == 0.0 and one["name"] not in MOTOR_LIMITS
-        known = "not known" if margin is None else f"{round(100.0 * margin, 2) + 0.0:.2f} %"
+        known = "not known" if margin is None else f"{_margin_digits(margin)} %"
         yield (
             one["name"], *requirement_words(one), known + " of its range" * of_lambda,
             requirement_place(one), one["evidence"],
         )  # fmt: skip
+
+
+def _margin_digits(margin: float, *, rounding: float = 1e-8) -> str:
+    """In percent; what is missed by less than the last digit is not shown as 0."""
+    missed_little = -5e-5 < margin < -rounding
+    return f"{100.0 * margin:.1g}" if missed_little else f"{round(100.0 * margin, 2) + 0.0:.2f}"
 
 
 def requirement_words(

@@ -38,7 +38,7 @@ def remarks(
     -------
     tuple of str
     """
-    return (*_at_bounds(result), *_without_margin(result, options), *_worst_move(result, options))
+    return (*_worst_move(result, options), *_at_bounds(result), *_without_margin(result, options))
 
 
 def _at_bounds(result: Mapping[str, Any]) -> Iterator[str]:

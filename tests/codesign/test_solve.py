@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from oracles.helpers import (
 )
 
 from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.formulations import Direct
+from ccd_casadi.codesign.run import solve
 from ccd_casadi.inner import main as inner
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
@@ -30,7 +34,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler as sampling
-from ccd_casadi.solve import main
+from ccd_casadi.solve import main, summary
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 from surrogates import load
@@ -339,3 +343,11 @@ def test_an_infeasible_run_leaves_no_design_of_an_earlier_one(
     assert run(tmp_path / "run", case=case) == 3
     assert not (tmp_path / "run" / "controller.json").exists()
     assert not (tmp_path / "run" / "surrogate.json").exists()
+
+
+def test_a_design_that_exceeds_a_constraint_has_no_objective_and_a_summary() -> None:
+    """J of it is not known: result.json has null, and the terminal says so."""
+    problem = problem_of(load_case(TWO_MASS))
+    solution = solve(problem, Direct(starts=1, box_points=0))
+    exceeded = replace(solution, result=solution.result | {"objective": None})
+    assert "objective     not known" in summary(exceeded)

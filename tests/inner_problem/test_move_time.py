@@ -396,8 +396,10 @@ def test_a_run_counts_what_feedforward_and_feedback_need_of_the_current() -> Non
     needed = max(entry["feedforward_force"], *(run.peak_force.max() for run in runs))
     assert entry["needed_force"] == pytest.approx(max(needed, entry["peak_force"]), rel=1e-3)
     short = {"status": "verified", "move": entry | {"needed_share": 1.2, "needed_current": 12.0}}
+    worst = f" on the worst of {entry['plants']} plants ({entry['needed_force_plant']})"
+    worst = worst if entry["needed_force_plant"] else ""
     assert [one.words for one in current_concern(short)] == [
-        "the move needs 12 A with feedforward and feedback, and peak_current is 10 A"
+        f"the move needs 12 A with feedforward and feedback{worst}, and peak_current is 10 A"
     ]
     assert "a larger peak_current" in advice(short)
     assert not current_concern({"move": entry | {"needed_share": 1.0}})

@@ -263,3 +263,31 @@ def test_a_decision_names_the_move_on_the_worst_plant_beside_the_models(
     assert ("settles after 105 ms on the model" in words) == bool(said)
     assert said in words
     assert advice(result_of() | {"move": move | {"plants": 1}}) == "Build this."
+
+
+@pytest.mark.parametrize(("latest", "late"), [(0.29, False), (0.31, True), (None, True)])
+def test_a_move_that_settles_when_the_next_has_begun_is_an_objection(
+    latest: float | None, late: bool
+) -> None:
+    move = {"settled": 0.1, "settled_latest": latest, "plants": 5, "duration": 0.1, "dwell": 0.2}
+    decided = decide(result_of() | {"move": move})
+    assert (decided.build is Build.IF_ACCEPTED) == late
+    assert ("the next one begins after 300 ms" in decided.words) == late
+    assert not decide(result_of() | {"move": move | {"dwell": 0.0}}).concerns
+
+
+def test_a_motor_that_sets_the_acceleration_leaves_feedback_its_share() -> None:
+    """The limits that it is given are lower by what feedback needs beyond them."""
+    move = {
+        "settled": 0.1, "settled_latest": 0.1, "plants": 5, "duration": 0.1, "dwell": 0.2,
+        "needed_power": 105.0, "needed_heat_share": 1.05, "needed_heat_plant": "load 2 kg",
+        "needed_current": 11.0, "needed_share": 1.1, "needed_force_plant": "load 3 kg",
+    }  # fmt: skip
+    words = advice(result_of() | {"move": move | {"limits": ["heat", "peak force"]}})
+    assert "rms_power = 95.2 in [motor]" in words
+    assert "peak_current = 9.09 in [motor]" in words
+    assert "load 2 kg" in words
+    assert "load 3 kg" in words
+    given = advice(result_of() | {"move": move | {"limits": ["acceleration"]}})
+    assert "in [motor]" not in given
+    assert "less acceleration in [move]" in given

@@ -257,3 +257,22 @@ def test_a_line_that_the_controller_blocks_is_no_error_of_the_bound(channels: in
     np.testing.assert_allclose(blocked[far], whole[far], rtol=1e-9)
     S = np.linalg.norm(np.linalg.inv(np.eye(channels) + G @ blocking), 2, axis=(1, 2))
     assert (blocked >= (1.0 - 1e-9) * np.maximum(S[1:], S[:-1])).all()
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "said"),
+    [((3, 1, slice(None)), 0.0, "is 0 at 4 Hz in output 2, whatever the input"),
+     ((3, slice(None), 0), 0.0, "is 0 at 4 Hz in every output of input 1"),
+     ((3,), 0.0, "is 0 at 4 Hz; "),
+     ((3, 1, 0), np.nan, "is not finite at 4 Hz, output 2, input 1")],
+)  # fmt: skip
+def test_a_dead_line_is_refused_by_its_frequency_and_channel(
+    where: tuple, value: float, said: str
+) -> None:
+    """An entry that is 0 is none: channels may be apart."""
+    G = np.full((8, 2, 2), 1.0 + 1.0j) + np.eye(2)
+    G[5, 0, 1] = 0.0
+    MeasuredResponse(np.arange(1.0, 9.0), G)
+    G[where] = value
+    with pytest.raises(UserError, match=said):
+        MeasuredResponse(np.arange(1.0, 9.0), G)
