@@ -33,7 +33,7 @@ from ccd_casadi.inner_problem.searched_problem import with_state
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepare_search, with_range
-from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.inner_problem.sweep import active_constraints, missed_bounds
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
@@ -162,6 +162,9 @@ def mixed_answer(
     held = judged.passed or (not feasible and bool(judged.figures))
     good = made.figures.certified and held and second.agrees is not False
     status = "verified" if good else "not_verified"
+    if good and not feasible:
+        missed = " and ".join(missed_bounds(problem.inner, made.figures))
+        answer["reason"] = f"one certified synthesis, which misses bounds of the case: {missed}"
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
 

@@ -213,6 +213,7 @@ def test_a_missed_bound_hides_no_unstable_loop(
     answer = mixed_answer(case, (60.0, 60.0), how)
     assert answer.status == "verified"
     assert not answer.figures["feasible"]
+    assert "misses bounds of the case: peak of S" in answer.figures["reason"]
     unstable = Judgement(1, {}, passed, "unstable on plant 1 of 1")
     monkeypatch.setattr(inner_answer, "judge_on_model", lambda *_: unstable)
     assert mixed_answer(case, (60.0, 60.0), how).status == "not_verified"
