@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 
 from ccd_casadi.analysis import MOTOR_LIMITS, Loads, MoveLimits
-from ccd_casadi.analysis.feedforward import feedforward_slopes, forward_force
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward_slopes, forward_force
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.fixed_parameters import reparametrise

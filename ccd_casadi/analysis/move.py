@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.feedforward import held_setpoint
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.analysis.setpoint_feedforward import held_setpoint
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.ports import course
 from ccd_casadi.lti.state_space import ClosedLoop, closed_loop

@@ -6,8 +6,8 @@ from math import isfinite
 
 import numpy as np
 
-from ccd_casadi.analysis.feedforward import forward_force, forward_gains
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.analysis.setpoint_feedforward import forward_force, forward_gains
 from ccd_casadi.codesign.reasons import Finding, Reason
 from ccd_casadi.deployment.fixed_point import Ranges
 from ccd_casadi.deployment.integer_equation import FixedPoint, Term

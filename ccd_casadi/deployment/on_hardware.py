@@ -9,9 +9,9 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.feedforward import forward_force, forward_gains, forward_of
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.analysis.setpoint_feedforward import forward_force, forward_gains, forward_of
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
 from ccd_casadi.lti.loop import DelayOptions

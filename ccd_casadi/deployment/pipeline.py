@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.feedforward import forward_of
 from ccd_casadi.analysis.loop_channels import (
     LoopChannel,
     along_directions,
@@ -16,6 +15,7 @@ from ccd_casadi.analysis.loop_channels import (
     whole_loop,
 )
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import forward_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment import Timing
 from ccd_casadi.deployment.discretise import (

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.feedforward import FeedforwardOptions
+from ccd_casadi.analysis.setpoint_feedforward import FeedforwardOptions
 from ccd_casadi.deployment.realisation import (
     Realisation,
     difference_equation,

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis import LIMITS
-from ccd_casadi.analysis.feedforward import feedforward_of, forward_force
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.move import Move, moves
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward_of, forward_force
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE

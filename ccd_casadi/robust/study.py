@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.feedforward import feedforward_of
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.move import Move, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.reasons import Reason
 from ccd_casadi.codesign.result import at_solve

@@ -11,9 +11,9 @@ from oracles.structured_text import run as run_text
 from oracles.two_encoders import DELAY, EXAMPLE, RATE, axis, broken, by_hand, held
 
 from ccd_casadi.analysis import LIMITS
-from ccd_casadi.analysis.feedforward import forward_of, held_setpoint
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import forward_of, held_setpoint
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun

@@ -17,10 +17,10 @@ from oracles.structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move import simulate as simulate_move
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward
 from ccd_casadi.deployment.on_hardware import (
     BACK,
     Electronics,

@@ -14,9 +14,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.feedforward import feedforward, held_setpoint
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward, held_setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.extensions.feedforward.coefficients import (
     ForceLimits,

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from oracles.helpers import few, random_plant
 
 from ccd_casadi.analysis import LIMITS, MoveLimits
-from ccd_casadi.analysis.feedforward import feedforward_of
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward_of
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.analysis import LIMITS
-from ccd_casadi.analysis.feedforward import feedforward_of
 from ccd_casadi.analysis.loop_channels import sampled_figures
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
 from ccd_casadi.analysis.move import Move, MoveOptions, moves
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint_feedforward import feedforward_of
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.drawing.svg import AMBER, BLUE, GREEN, GREY, PURPLE

@@ -46,9 +46,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linprog
 
-from ccd_casadi.analysis.feedforward import held_setpoint
 from ccd_casadi.analysis.move import counted_rows
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.analysis.setpoint_feedforward import held_setpoint
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.support.arrays import Array, states

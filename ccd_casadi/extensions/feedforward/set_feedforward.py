@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from ccd_casadi.analysis.feedforward import forward_of
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.analysis.setpoint_feedforward import forward_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.robust_set import members
 from ccd_casadi.extensions.feedforward.coefficients import (
