@@ -129,7 +129,7 @@ def _terminal(r: Mapping[str, Any], text: str) -> Claims:
         ("peak at", rf"sensitivity peak {NUMBER} at ({NUMBER}) Hz", r["sensitivity_peak_hz"], 1.0),
         ("low", rf"\|S\| ({NUMBER}) at omega_low", r["sensitivity_low"], 1.0),
         ("phase", rf"margins phase ({NUMBER}) deg", r["phase_margin_deg"], 1.0),
-        ("modulus", rf"modulus ({NUMBER});", r["modulus_margin"], 1.0),
+        ("modulus", rf"modulus ({NUMBER})(?:;|\s|$)", r["modulus_margin"], 1.0),
         ("crossover", rf"crossover ({NUMBER}) Hz", r["crossover_hz"], 1.0),
         ("overshoot", rf"overshoot ({NUMBER}) %", r["step_overshoot"], 100.0),
         ("cost", rf"cost ({NUMBER}) syntheses", r["syntheses"], 1.0),
