@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.motor import MotionAt, MotionOptions
+from ccd_casadi.analysis.driven_plant import MotionAt
+from ccd_casadi.analysis.motor import MotionOptions
 from ccd_casadi.analysis.setpoint_feedforward import forward_force
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling, tustin, zoh

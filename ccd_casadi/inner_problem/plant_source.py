@@ -293,7 +293,7 @@ def _build(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         plant = _below(replace(source, motion=None), size, names, lower, upper)
         own = replace(source, motion=None, wide=False)  # motors are where its own inputs are
         count = _below(own, size, names, lower, upper).inputs if source.wide else plant.inputs
-        from ccd_casadi.analysis.motor import with_motion
+        from ccd_casadi.analysis.driven_plant import with_motion
 
         def loads() -> list[Plant]:
             """The plant of every option, over θ and what varies, as a set of plants has them."""

@@ -7,7 +7,7 @@ from operator import call
 
 import numpy as np
 
-from ccd_casadi.analysis.motor import DrivenMechanics, MotionAt
+from ccd_casadi.analysis.driven_plant import DrivenMechanics, MotionAt
 from ccd_casadi.analysis.move import Move, simulate
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.analysis.yield_bound import Yield

@@ -9,7 +9,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.analysis.motor import DrivenMechanics
+from ccd_casadi.analysis.driven_plant import DrivenMechanics
 from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import (
     ChannelStructure,

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from oracles.differences import slopes
 
-from ccd_casadi.analysis.motor import Motion, motion_at
+from ccd_casadi.analysis.driven_plant import motion_at
+from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

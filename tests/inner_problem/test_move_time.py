@@ -14,15 +14,8 @@ from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.motor import (
-    DrivenMechanics,
-    Motion,
-    MotionAt,
-    MotionOptions,
-    Motor,
-    cycle_of,
-    with_motion,
-)
+from ccd_casadi.analysis.driven_plant import DrivenMechanics, MotionAt, with_motion
+from ccd_casadi.analysis.motor import Motion, MotionOptions, Motor, cycle_of
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.analysis.setpoint import setpoint

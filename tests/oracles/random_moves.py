@@ -21,7 +21,8 @@ import numpy as np
 from scipy.linalg import eigh, expm
 
 from ccd_casadi.analysis import MoveLimits
-from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
+from ccd_casadi.analysis.driven_plant import MotionAt, motion_at
+from ccd_casadi.analysis.motor import Motion, Motor
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.cases.run_folder import read_run

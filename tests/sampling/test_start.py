@@ -89,7 +89,7 @@ def test_a_solve_of_full_order_imports_no_search_of_sections() -> None:
     other = (
         "codesign.catalogue", "codesign.outer_structured", "fixed_structure.local_search",
         "inner_problem.structured_search", "sampling.structured_units", "analysis.motor",
-        "cases.run_folder", "budget.evaluation",
+        "analysis.driven_plant", "cases.run_folder", "budget.evaluation",
     )  # fmt: skip
     words = "import sys, ccd_casadi.codesign.run, ccd_casadi.reporting.solve_page\n"
     words += f"found = {{'ccd_casadi.' + name for name in {other}}} & set(sys.modules)\n"
