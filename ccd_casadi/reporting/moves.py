@@ -126,11 +126,18 @@ def cycle_chapter(
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(shown["power"], "mean")
     ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration
+    worst = len(found.inertia) > 1 or found.motion.loads.gain > 0.0
+    drawn = {"": force[:, 0]}
+    if worst and not lagged:  # the heat is of the second
+        drawn = {"feedforward, of the model": force[:, 0], "rigid body, worst plant": bodies[:, 0]}
+    forces, currents = (
+        tuple(c.Curve(ms, y / unit, label, colour)
+              for (label, y), colour in zip(drawn.items(), (BLUE, ORANGE), strict=False))
+        for unit in (1.0, k)
+    )  # fmt: skip
     panels = [
-        c.Panel(
-            "time (ms)", spoken("force of a motor (N)"), (c.Curve(ms, force[:, 0]),), levels=(end,)
-        ),
-        c.Panel("time (ms)", "its current (A)", (c.Curve(ms, force[:, 0] / k),)),
+        c.Panel("time (ms)", spoken("force of a motor (N)"), forces, levels=(end,)),
+        c.Panel("time (ms)", "its current (A)", currents),
         c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
     if not own.required:
@@ -144,7 +151,6 @@ def cycle_chapter(
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < Motor.unlimited
     held = found.holding is not None
-    worst = len(found.inertia) > 1 or found.motion.loads.gain > 0.0
     known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required, held, lagged,
              worst)  # fmt: skip
     words = paragraph("report.cycle", shown, *known)
