@@ -206,17 +206,18 @@ def heat_concern(
 
 
 def late_move_concern(result: Mapping[str, Any]) -> list[Concern]:
-    """List a move that settles on the worst plant only when the next one has begun; empty where it
-    settles before, or where moves do not follow each other."""
+    """List a move that settles, on the worst plant, only when the next one has begun; empty where
+    it settles before, or where moves do not follow each other."""
     move = result.get("move") or {}
-    if not move.get("dwell") or move["plants"] < 2:
+    if not move.get("dwell"):
         return []
     cycle, latest = move["duration"] + move["dwell"], move["settled_latest"]
     if latest is not None and latest <= cycle:
         return []
     when = "does not settle" if latest is None else f"settles after {with_unit(latest, 's')}"
-    words = f"the move {when} on the worst of {move['plants']} plants, and the next one begins"
-    return [Concern(ConcernKind.LATE, f"{words} after {with_unit(cycle, 's')}")]
+    where = f" on the worst of {move['plants']} plants" if move["plants"] > 1 else ""
+    words = f"the move {when}{where}, and the next one begins after {with_unit(cycle, 's')}"
+    return [Concern(ConcernKind.LATE, words)]
 
 
 def motor_remedies(result: Mapping[str, Any]) -> dict[ConcernKind, str]:

@@ -265,14 +265,17 @@ def test_a_decision_names_the_move_on_the_worst_plant_beside_the_models(
     assert advice(result_of() | {"move": move | {"plants": 1}}) == "Build this."
 
 
+@pytest.mark.parametrize("plants", [1, 5])
 @pytest.mark.parametrize(("latest", "late"), [(0.29, False), (0.31, True), (None, True)])
 def test_a_move_that_settles_when_the_next_has_begun_is_an_objection(
-    latest: float | None, late: bool
+    latest: float | None, late: bool, plants: int
 ) -> None:
-    move = {"settled": 0.1, "settled_latest": latest, "plants": 5, "duration": 0.1, "dwell": 0.2}
+    move = {"settled": 0.1, "settled_latest": latest, "plants": plants, "duration": 0.1,
+            "dwell": 0.2}  # fmt: skip
     decided = decide(result_of() | {"move": move})
     assert (decided.build is Build.IF_ACCEPTED) == late
     assert ("the next one begins after 300 ms" in decided.words) == late
+    assert ("on the worst of 5 plants" in decided.words) == (late and plants > 1)
     assert not decide(result_of() | {"move": move | {"dwell": 0.0}}).concerns
 
 
